@@ -1,0 +1,47 @@
+"""mushpipe: RGB-D camera above a mushroom bed in, pick targets for a robot out.
+
+This module is what a plugin author needs.
+"""
+
+from mushpipe.core.errors import InputError, MushpipeError
+from mushpipe.core.geometry import Camera, quaternion_from_axis
+from mushpipe.core.plugins import Registry, hookimpl
+from mushpipe.core.stage import GraphPath, ReplaySource, RunInfo, Sink, Source, Stage
+from mushpipe.core.tables import (
+    Circles,
+    Columns,
+    DepthSource,
+    Locations,
+    PickFlag,
+    Picks,
+    Poses,
+    column,
+)
+from mushpipe.core.types import Header, Mask, RgbdFrame, Trace
+
+__all__ = [
+    "Camera",
+    "Circles",
+    "Columns",
+    "DepthSource",
+    "GraphPath",
+    "Header",
+    "InputError",
+    "Locations",
+    "Mask",
+    "MushpipeError",
+    "PickFlag",
+    "Picks",
+    "Poses",
+    "Registry",
+    "ReplaySource",
+    "RgbdFrame",
+    "RunInfo",
+    "Sink",
+    "Source",
+    "Stage",
+    "Trace",
+    "column",
+    "hookimpl",
+    "quaternion_from_axis",
+]

@@ -1,0 +1,266 @@
+"""The command line: `mushpipe run graph.yaml` and its siblings."""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+from collections.abc import Iterator
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from mushpipe.core.plan import Plan
+
+app = typer.Typer(
+    help="RGB-D camera above a mushroom bed in, pick targets for a robot out.\n\n"
+    "mushpipe run graphs/demo.yaml\n\n"
+    "mushpipe run graphs/pick.yaml --source field.mcap --set sinks.log.path=out.mcap\n\n"
+    "mushpipe export out.mcap --format csv",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+plugins_app = typer.Typer(help="What is installed.", no_args_is_help=True)
+app.add_typer(plugins_app, name="plugins")
+
+GraphArgument = Annotated[Path, typer.Argument(help="graph file, or a failure capsule")]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="A.B=VALUE", help="change a setting: segment.use=otsu"),
+]
+SourceOption = Annotated[
+    str | None, typer.Option("--source", help="recording to play, or name of a source plugin")
+]
+FramesOption = Annotated[int | None, typer.Option("--frames", help="stop after N frames")]
+
+
+class Drawing(StrEnum):
+    """Formats of `mushpipe graph`."""
+
+    mermaid = "mermaid"
+    dot = "dot"
+
+
+class Output(StrEnum):
+    """Formats of listings."""
+
+    text = "text"
+    json = "json"
+
+
+class Export(StrEnum):
+    """Formats of `mushpipe export`."""
+
+    ndjson = "ndjson"
+    csv = "csv"
+
+
+def _out(text: str) -> None:
+    sys.stdout.write(text + "\n")
+
+
+def _compile(graph: Path, overrides: list[Any], source: str | None) -> Plan:
+    import logging
+
+    from mushpipe.core.capsule import capsule_document
+    from mushpipe.core.document import read_document
+    from mushpipe.core.graph import compile_document
+    from mushpipe.core.plugins import load_registry
+
+    document = capsule_document(graph) if graph.suffix == ".mcap" else read_document(graph)
+    plan = compile_document(document, load_registry(), overrides, source)
+    for warning in plan.warnings:
+        logging.getLogger("mushpipe").warning(warning)
+    return plan
+
+
+def _execute(plan: Plan, manifest: Path | None, capsules: Path) -> int:
+    """Run a plan in front of a user; ``manifest`` None writes none. Return the exit code."""
+    from mushpipe.console import interruptible, progress_bar, show_report, stderr
+    from mushpipe.core.manifest import build_manifest
+    from mushpipe.core.run import run as run_plan
+
+    stop = threading.Event()
+    with interruptible(stop), progress_bar() as show:
+        report = run_plan(plan, stop, show, capsules)
+    show_report(report)
+    if manifest is not None:
+        manifest.parent.mkdir(parents=True, exist_ok=True)
+        content = {**build_manifest(plan), "result": report.summary()}
+        manifest.write_text(json.dumps(content, indent=2) + "\n")
+        stderr.print(f"manifest: {manifest}", style="dim")
+    if report.error is not None:
+        stderr.print(f"error: {report.error}", style="bold red", markup=False)
+    return report.exit_code
+
+
+@app.command()
+def run(
+    graph: GraphArgument,
+    source: SourceOption = None,
+    set_: SetOption = None,
+    frames: FramesOption = None,
+    start: Annotated[float | None, typer.Option(help="skip so many seconds")] = None,
+    end: Annotated[float | None, typer.Option(help="stop at this second")] = None,
+    speed: Annotated[
+        float | None, typer.Option(help="pace: 1 is real time, 0 as fast as possible")
+    ] = None,
+    loop: Annotated[int | None, typer.Option(help="times to play; 0 is for ever")] = None,
+    manifest: Annotated[Path | None, typer.Option(help="where to write run.json")] = None,
+    capsules: Annotated[Path, typer.Option(help="folder for failing frames")] = Path("failures"),
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log more")] = False,
+) -> None:
+    """Run a graph on its source, or on another one given by --source."""
+    from mushpipe.console import set_up_logging
+    from mushpipe.core.manifest import manifest_path
+
+    set_up_logging(verbose)
+    flags = {"max_frames": frames, "start": start, "end": end, "speed": speed, "loop": loop}
+    overrides: list[Any] = [
+        (f"source.{key}={value}", f"--{'frames' if key == 'max_frames' else key} {value}")
+        for key, value in flags.items()
+        if value is not None
+    ]
+    plan = _compile(graph, [*overrides, *(set_ or [])], source)
+    raise typer.Exit(_execute(plan, manifest or manifest_path(plan), capsules))
+
+
+@app.command()
+def validate(
+    graph: GraphArgument,
+    source: SourceOption = None,
+    set_: SetOption = None,
+    output: Annotated[Output, typer.Option("--format")] = Output.text,
+) -> None:
+    """Check a graph file without running it; report every fault at once."""
+    from dataclasses import asdict
+
+    from mushpipe.core.errors import GraphError
+
+    try:
+        plan = _compile(graph, set_ or [], source)
+    except GraphError as error:
+        if output is Output.json:
+            _out(json.dumps({"problems": [asdict(problem) for problem in error.problems]}))
+            raise typer.Exit(error.exit_code) from None
+        raise
+    if output is Output.json:
+        _out(json.dumps({"problems": [], "warnings": plan.warnings, "graph": plan.resolved()}))
+    else:
+        _out(f"{graph}: {len(plan.stages)} stages, {len(plan.sinks)} sinks, no faults")
+
+
+@app.command()
+def graph(
+    graph: GraphArgument,
+    output: Annotated[Drawing, typer.Option("--format")] = Drawing.mermaid,
+    set_: SetOption = None,
+) -> None:
+    """Draw a graph as text: Mermaid or DOT."""
+    from mushpipe.core import draw
+
+    plan = _compile(graph, set_ or [], None)
+    _out(draw.dot(plan) if output is Drawing.dot else draw.mermaid(plan))
+
+
+@app.command()
+def record(
+    out: Annotated[Path, typer.Option("--out", "-o", help="recording to write")],
+    source: Annotated[str, typer.Option(help="source plugin, or a recording to copy")],
+    set_: SetOption = None,
+    frames: FramesOption = None,
+    jpeg: Annotated[int | None, typer.Option(help="store colour as JPEG of this quality")] = None,
+) -> None:
+    """Record a source, losing nothing."""
+    from mushpipe.console import set_up_logging
+    from mushpipe.core.document import Document
+    from mushpipe.core.graph import compile_document
+    from mushpipe.core.plugins import load_registry
+
+    set_up_logging(False)
+    sink = {"use": "mcap", "path": str(out.absolute()), "jpeg_quality": jpeg, "timing": False}
+    document = Document("record", Path.cwd(), {"mushpipe": 1, "sinks": {"recorder": sink}})
+    limit = [] if frames is None else [(f"source.max_frames={frames}", f"--frames {frames}")]
+    plan = compile_document(document, load_registry(), [*limit, *(set_ or [])], source)
+    raise typer.Exit(_execute(plan, None, Path("failures")))
+
+
+@app.command()
+def info(
+    file: Annotated[Path, typer.Argument(help="recording or results")],
+    output: Annotated[Output, typer.Option("--format")] = Output.text,
+) -> None:
+    """Tell what a recording holds, and whether it is whole."""
+    from mushpipe.info import describe, render
+
+    content = describe(file)
+    _out(json.dumps(content) if output is Output.json else render(content))
+    raise typer.Exit(4 if content["damage"] else 0)
+
+
+@app.command()
+def export(
+    results: Annotated[Path, typer.Argument(help="recording written by a sink mcap")],
+    output: Annotated[Export, typer.Option("--format")] = Export.ndjson,
+    topic: Annotated[str | None, typer.Option(help="which picks, where there are several")] = None,
+) -> None:
+    """Print the picks of a result recording: one JSON line per frame, or one CSV line per pick."""
+    from mushpipe.export import csv_lines, ndjson_lines
+
+    lines: Iterator[str] = (csv_lines if output is Export.csv else ndjson_lines)(results, topic)
+    for line in lines:
+        _out(line)
+
+
+@app.command()
+def schema(
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="file to write")] = None,
+) -> None:
+    """Print the JSON Schema of graph files, for completion in an editor."""
+    from mushpipe.core.plugins import load_registry
+    from mushpipe.core.schema import graph_schema
+
+    text = json.dumps(graph_schema(load_registry()), indent=2)
+    _out(text) if out is None else out.write_text(text + "\n")
+
+
+@plugins_app.command("list")
+def plugins_list(
+    output: Annotated[Output, typer.Option("--format")] = Output.text,
+) -> None:
+    """List stages, sources and sinks, and plugins that failed to load."""
+    from mushpipe.core.plugins import load_registry
+    from mushpipe.info import plugin_rows, render_plugins
+
+    registry = load_registry()
+    rows = plugin_rows(registry)
+    _out(json.dumps(rows) if output is Output.json else render_plugins(rows))
+
+
+@plugins_app.command("describe")
+def plugins_describe(
+    name: Annotated[str, typer.Argument(help="name of a plugin, or file.py:Class")],
+) -> None:
+    """Show what a plugin does, its inputs and outputs, and its settings."""
+    from mushpipe.core.plugins import load_registry
+    from mushpipe.info import describe_plugin
+
+    _out(describe_plugin(load_registry(), name))
+
+
+def main() -> None:
+    """Entry point: errors meant for the user become one message and an exit code."""
+    from mushpipe.core.errors import MushpipeError
+
+    try:
+        app()
+    except MushpipeError as error:
+        sys.stderr.write(f"error: {error}\n")
+        sys.exit(error.exit_code)
+    except BrokenPipeError:
+        sys.stderr.close()
+        sys.exit(0)

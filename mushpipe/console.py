@@ -1,0 +1,98 @@
+"""What the command line shows: logs, progress, tables. All of it goes to stderr."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from rich.console import Console
+from rich.logging import RichHandler
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from mushpipe.core.errors import EXIT_INTERRUPTED
+from mushpipe.core.report import RunReport
+
+stderr = Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+def set_up_logging(verbose: bool) -> None:
+    """Send the log of the package to stderr."""
+    plain = logging.Formatter("%(levelname)s: %(message)s")
+    handler: logging.Handler = logging.StreamHandler()
+    if stderr.is_terminal:
+        handler = RichHandler(console=stderr, show_time=False, show_path=False)
+        plain = logging.Formatter("%(message)s")
+    handler.setFormatter(plain)
+    logger = logging.getLogger("mushpipe")
+    logger.handlers[:] = [handler]
+    logger.setLevel(logging.DEBUG if verbose else logging.INFO)
+
+
+@contextmanager
+def interruptible(stop: threading.Event) -> Iterator[None]:
+    """Set ``stop`` on the first Ctrl-C or SIGTERM; leave at once on the second."""
+
+    def handle(number: int, _: Any) -> None:
+        if stop.is_set():
+            os._exit(EXIT_INTERRUPTED)
+        stop.set()
+        name = signal.Signals(number).name
+        stderr.print(f"{name}: finishing this frame; once more leaves at once", style="yellow")
+
+    old = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in old.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def progress_bar() -> Iterator[Any]:
+    """Yield a function that shows a `RunReport`; it shows nothing where stderr is no terminal."""
+    if not stderr.is_terminal:
+        yield None
+        return
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=stderr, transient=True) as bar:
+        task = bar.add_task("waiting for the first frame", total=None)
+        started = time.monotonic()
+
+        def show(report: RunReport) -> None:
+            rate = report.processed / max(time.monotonic() - started, 1e-9)
+            text = f"{report.processed} frames  {rate:.1f} fps  {report.dropped} dropped"
+            bar.update(task, description=text)
+
+        yield show
+
+
+def show_report(report: RunReport) -> None:
+    """Print the time per stage, the balance, and what was lost."""
+    if any(d.count for d in report.durations.values()):
+        table = Table("stage", "p50 ms", "p95 ms", "max ms", box=None, pad_edge=False)
+        for column in table.columns[1:]:
+            column.justify = "right"
+        for name, durations in report.durations.items():
+            table.add_row(name, *(f"{value:.2f}" for value in durations.summary().values()))
+        stderr.print(table)
+    rate = report.processed / report.elapsed_s if report.elapsed_s else 0.0
+    stderr.print(
+        f"{report.frames_in} frames in = {report.processed} processed + {report.dropped} dropped "
+        f"+ {report.failed} failed, in {report.elapsed_s:.1f} s ({rate:.1f} frames/s)"
+    )
+    for name, count in report.source.items():
+        stderr.print(f"{count} {name}", style="yellow")
+    for name, sink in report.sinks.items():
+        if sink.dropped or sink.failed:
+            stderr.print(f"{name}: {sink.dropped} dropped, {sink.failed} failed", style="yellow")
+    if not report.balanced():
+        stderr.print("the balance does not close: frames were lost unaccounted", style="bold red")
+    for path in report.capsules:
+        stderr.print(f"the failing frame is saved: mushpipe run {path} repeats the failure")

@@ -1,0 +1,1 @@
+"""The framework: types, stages, graph, plugins and the loop that runs them."""

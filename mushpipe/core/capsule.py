@@ -1,0 +1,48 @@
+"""Failure capsules: the failing frame and its graph in one small MCAP that can be run again."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from mushpipe.core.document import Document
+from mushpipe.core.errors import UsageError
+from mushpipe.core.plan import Node, Plan
+from mushpipe.core.recording import GRAPH, RecordingReader, RecordingWriter
+from mushpipe.core.types import RgbdFrame
+
+
+def write_capsule(folder: Path, plan: Plan, node: Node, frame: RgbdFrame, message: str) -> Path:
+    """Write the frame on which a node failed, with the graph up to it, and return the path.
+
+    The graph keeps its stages, and of its sinks only a failing one: running a capsule must not
+    reach a robot or write over results.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"failure-{node.name}-{frame.header.sequence}.mcap"
+    kept = replace(plan, sinks=tuple(sink for sink in plan.sinks if sink.name == node.name))
+    metadata = {GRAPH: {"json": json.dumps(kept.resolved()), "failure": message}}
+    writer = RecordingWriter(path, metadata)
+    writer.frame(frame)
+    writer.close()
+    return path
+
+
+def capsule_document(path: Path) -> Document:
+    """Return the graph stored in a capsule, with the capsule as its source.
+
+    Raises:
+        UsageError: The file holds no graph.
+        InputError: The file cannot be read.
+    """
+    stored = RecordingReader(path).index().metadata.get(GRAPH)
+    if stored is None:
+        raise UsageError(
+            f"{path} is a recording, not a graph: write a graph file and play the recording with "
+            f"mushpipe run GRAPH --source {path}"
+        )
+    data: dict[str, Any] = json.loads(stored["json"])
+    data["source"] = {"use": "mcap", "path": str(path.absolute())}
+    return Document(str(path), path.parent, data)

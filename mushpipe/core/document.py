@@ -1,0 +1,152 @@
+"""A YAML file as plain data plus the place of every key and value in it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from mushpipe.core.errors import GraphError, Problem
+
+Location = tuple[str | int, ...]
+MAX_NODES = 20_000
+_SCALARS = {"null", "bool", "int", "float", "str", "timestamp"}
+
+
+@dataclass
+class Document:
+    """The data of a graph file; ``marks`` gives (line, column) of each key and value, from 1."""
+
+    file: str
+    base: Path
+    data: dict[str, Any] = field(default_factory=dict)
+    lines: list[str] = field(default_factory=list)
+    keys: dict[Location, tuple[int, int]] = field(default_factory=dict)
+    values: dict[Location, tuple[int, int]] = field(default_factory=dict)
+    overrides: dict[Location, str] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+
+    def problem(self, at: Location, message: str, hint: str = "", key: bool = False) -> Problem:
+        """Place a message at a location, or at the nearest place above it that is in the file."""
+        for end in range(len(at), -1, -1):
+            if at[:end] in self.overrides:
+                return Problem(self.overrides[at[:end]], 0, 0, message, hint)
+            marks = self.keys if key and end == len(at) else self.values
+            if at[:end] in marks:
+                line, column = marks[at[:end]]
+                return Problem(self.file, line, column, message, hint, self._excerpt(line))
+        return Problem(self.file, 0, 0, message, hint)
+
+    def _excerpt(self, line: int) -> str:
+        return self.lines[line - 1].rstrip() if line <= len(self.lines) else ""
+
+    def from_shell(self, at: Location) -> set[str | int]:
+        """Return the keys directly below a location that the command line set."""
+        return {path[len(at)] for path in self.overrides if path[: len(at)] == at != path}
+
+
+def read_document(path: Path) -> Document:
+    """Read a YAML file.
+
+    Raises:
+        GraphError: It is missing, not UTF-8, not YAML, not a mapping, has a key twice, a tag
+            other than the plain ones, or is too large after its aliases are expanded.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise GraphError([Problem(str(path), 0, 0, "there is no such file")]) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise GraphError([Problem(str(path), 0, 0, f"cannot be read: {error}")]) from error
+    return parse_document(text, str(path), path.parent)
+
+
+def parse_document(text: str, file: str, base: Path) -> Document:
+    """Parse YAML text; see `read_document`."""
+    document = Document(file, base, lines=text.splitlines())
+    try:
+        root = yaml.compose(text, Loader=yaml.SafeLoader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line, column = (mark.line + 1, mark.column + 1) if mark else (0, 0)
+        excerpt = document._excerpt(line) if line else ""
+        message = f"not valid YAML: {error.problem or error.context}"
+        raise GraphError([Problem(file, line, column, message, "", excerpt)]) from error
+    except (yaml.YAMLError, RecursionError) as error:
+        reason = "it is nested too deeply" if isinstance(error, RecursionError) else error
+        raise GraphError([Problem(file, 0, 0, f"not valid YAML: {reason}")]) from error
+    builder = _Builder(document)
+    data = builder.build(root, ()) if root else None
+    if not builder.problems and not isinstance(data, dict):
+        builder.problems.append(Problem(file, 1, 1, "expected a mapping such as 'mushpipe: 1'"))
+    if builder.problems or not isinstance(data, dict):
+        raise GraphError(builder.problems)
+    document.data = data
+    return document
+
+
+class _Builder:
+    """Turns a tree of YAML nodes into data, noting places and collecting problems."""
+
+    def __init__(self, document: Document) -> None:
+        self.document = document
+        self.problems: list[Problem] = []
+        self.nodes = 0
+        self.loader = yaml.SafeLoader("")
+
+    def build(self, node: yaml.Node, at: Location) -> Any:
+        self.document.values[at] = (node.start_mark.line + 1, node.start_mark.column + 1)
+        self.nodes += 1
+        if self.nodes > MAX_NODES or len(at) > 50:
+            if self.nodes >= 0:
+                self._object(at, "too large after its aliases are expanded")
+            self.nodes = -(10**9)  # said once; unwind without building more
+            return None
+        if self.nodes < 0:
+            return None
+        if isinstance(node, yaml.MappingNode):
+            return dict(self._pairs(node, at))
+        if isinstance(node, yaml.SequenceNode):
+            return [self.build(item, (*at, i)) for i, item in enumerate(node.value)]
+        return self._scalar(node, at)
+
+    def _pairs(self, node: yaml.MappingNode, at: Location) -> Iterator[tuple[str, Any]]:
+        seen: set[str] = set()
+        for key_node, value_node in node.value:
+            key = key_node.value if isinstance(key_node, yaml.ScalarNode) else "?"
+            mark = (key_node.start_mark.line + 1, key_node.start_mark.column + 1)
+            if key in seen:
+                line, column = mark
+                self.problems.append(
+                    Problem(
+                        self.document.file,
+                        line,
+                        column,
+                        f"the key '{key}' stands twice",
+                        f"it stands first in line {self.document.keys[(*at, key)][0]}",
+                        self.document._excerpt(line),
+                    )
+                )
+                continue
+            seen.add(key)
+            self.document.keys[(*at, key)] = mark
+            yield key, self.build(value_node, (*at, key))
+
+    def _scalar(self, node: yaml.Node, at: Location) -> Any:
+        tag = node.tag.removeprefix("tag:yaml.org,2002:")
+        if tag not in _SCALARS:
+            self._object(at, f"the tag '{node.tag}' is not allowed: plain values only")
+            return None
+        if tag == "timestamp":
+            return node.value
+        try:
+            return self.loader.construct_object(node)
+        except (ValueError, yaml.YAMLError) as error:
+            self._object(at, f"not a valid {tag}: {error}")
+            return None
+
+    def _object(self, at: Location, message: str) -> None:
+        self.problems.append(self.document.problem(at, message))

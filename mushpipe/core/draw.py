@@ -1,0 +1,58 @@
+"""A graph as a picture in text: Mermaid for Markdown, DOT for Graphviz."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from mushpipe.core.plan import Node, Plan
+from mushpipe.core.types import Trace
+
+_SHAPES = {"source": ("([", "])"), "stage": ("[", "]"), "sink": ("[/", "/]")}
+_DOT_SHAPES = {"source": "oval", "stage": "box", "sink": "parallelogram"}
+
+
+def _nodes(plan: Plan) -> tuple[Node, ...]:
+    return (plan.source, *plan.stages, *plan.sinks)
+
+
+def _edges(plan: Plan) -> Iterator[tuple[str, str, str]]:
+    """Yield (producer, consumer, type); a sink that records everything has one edge per stage."""
+    types = {node.name: node.ports.outputs for node in _nodes(plan)}
+    for node in _nodes(plan):
+        for link in node.links.values():
+            yield link.producer, node.name, types[link.producer][link.output].__name__
+        if any(port.type is Trace for port in node.ports.inputs):
+            for other in (plan.source, *plan.stages):
+                yield other.name, node.name, ""
+
+
+def _text(plan: Plan, node: Node) -> tuple[str, str]:
+    delivery = f", {plan.delivery(node)}" if node.kind == "sink" else ""
+    return node.name, f"{node.use}{delivery}"
+
+
+def mermaid(plan: Plan) -> str:
+    """Return a Mermaid flowchart, edges labelled with port types."""
+    ids = {node.name: f"n{i}" for i, node in enumerate(_nodes(plan))}
+    lines = ["flowchart TD"]
+    for node in _nodes(plan):
+        begin, end = _SHAPES[node.kind]
+        name, detail = _text(plan, node)
+        lines.append(f'  {ids[node.name]}{begin}"{name}<br/><small>{detail}</small>"{end}')
+    for producer, consumer, label in _edges(plan):
+        arrow = f"-->|{label}|" if label else "-.->"
+        lines.append(f"  {ids[producer]} {arrow} {ids[consumer]}")
+    return "\n".join(lines)
+
+
+def dot(plan: Plan) -> str:
+    """Return a Graphviz digraph, edges labelled with port types."""
+    lines = ["digraph mushpipe {"]
+    for node in _nodes(plan):
+        name, detail = _text(plan, node)
+        label = f"{name}\\n{detail}".replace('"', '\\"')
+        lines.append(f'  "{name}" [shape={_DOT_SHAPES[node.kind]}, label="{label}"];')
+    for producer, consumer, label in _edges(plan):
+        style = f'label="{label}"' if label else "style=dashed"
+        lines.append(f'  "{producer}" -> "{consumer}" [{style}];')
+    return "\n".join([*lines, "}"])

@@ -1,0 +1,109 @@
+"""The threads at the edges of a run: one reads ahead from the source, one feeds each sink."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from itertools import islice
+from typing import Any
+
+from mushpipe.core.errors import MushpipeError, StageError
+from mushpipe.core.mailbox import Mailbox
+from mushpipe.core.plan import Node
+from mushpipe.core.report import SinkReport
+from mushpipe.core.stage import ReplaySource, Source
+from mushpipe.core.types import RgbdFrame
+
+READ_AHEAD = 2
+SINK_QUEUE = 4
+
+
+def failure(node: Node, sequence: int | None, error: Exception) -> StageError:
+    """Say which plugin failed on which frame, keeping the exit code of a known error."""
+    at = "" if sequence is None else f" on frame {sequence}"
+    known = isinstance(error, MushpipeError)
+    text = str(error) if known else f"{type(error).__name__}: {error}"
+    code = error.exit_code if isinstance(error, MushpipeError) else 1
+    return StageError(f"{node.kind} '{node.name}' ({node.use}) failed{at}: {text}", code)
+
+
+def paced(frames: Iterator[RgbdFrame], speed: float, stop: threading.Event) -> Iterator[RgbdFrame]:
+    """Yield frames at their recorded pace times ``speed``; 0 does not wait."""
+    first: tuple[int, float] | None = None
+    for frame in frames:
+        if speed and first:
+            due = first[1] + (frame.header.stamp_ns - first[0]) / 1e9 / speed
+            if stop.wait(max(0.0, due - time.monotonic())):
+                return
+        first = first or (frame.header.stamp_ns, time.monotonic())
+        yield frame
+
+
+class SourceThread(threading.Thread):
+    """Reads ahead; ``error`` holds what ended the source early."""
+
+    def __init__(self, node: Node, source: Source, stop: threading.Event) -> None:
+        super().__init__(name="mushpipe-source", daemon=True)
+        self.node = node
+        self.source = source
+        self.stop = stop
+        self.error: MushpipeError | None = None
+        self.box: Mailbox[RgbdFrame] = (
+            Mailbox(1, latest=True) if source.live else Mailbox(READ_AHEAD)
+        )
+
+    def run(self) -> None:
+        """Hand over frames until the source ends, fails, or the run stops."""
+        speed = self.source.speed if isinstance(self.source, ReplaySource) else 0.0
+        frames = self.source.frames()
+        try:
+            for frame in islice(paced(frames, speed, self.stop), self.source.max_frames):
+                if self.stop.is_set() or not self.box.put(frame):
+                    break
+        except MushpipeError as error:
+            self.error = error
+        except Exception as error:
+            self.error = failure(self.node, None, error)
+        finally:
+            frames.close() if hasattr(frames, "close") else None
+            self.box.close()
+
+
+class SinkThread(threading.Thread):
+    """Feeds one sink in order; with ``tolerant`` a failing frame is counted and the next tried."""
+
+    def __init__(self, node: Node, latest: bool, tolerant: int) -> None:
+        super().__init__(name=f"mushpipe-{node.name}", daemon=True)
+        self.node = node
+        self.tolerant = tolerant
+        self.error: MushpipeError | None = None
+        self.failed_frame: RgbdFrame | None = None
+        self.consumed = self.failed = 0
+        self.box: Mailbox[tuple[RgbdFrame, dict[str, Any]]] = Mailbox(
+            1 if latest else SINK_QUEUE, latest
+        )
+
+    def run(self) -> None:
+        """Consume until the box is closed and empty, or too many frames in a row failed."""
+        in_a_row = 0
+        consume = getattr(self.node.plugin, "consume")  # noqa: B009 - checked by ports_of
+        while (item := self.box.get()) is not None:
+            frame, inputs = item
+            try:
+                consume(**inputs)
+                self.consumed += 1
+                in_a_row = 0
+            except Exception as error:
+                self.failed += 1
+                in_a_row += 1
+                if in_a_row >= self.tolerant:
+                    self.error = failure(self.node, frame.header.sequence, error)
+                    self.failed_frame = frame
+                    self.box.close()
+                    return
+
+    def report(self) -> SinkReport:
+        """Return the sink's balance; frames left in its box by a failure count as dropped."""
+        box = self.box
+        return SinkReport(box.accepted, self.consumed, box.dropped + box.waiting, self.failed)

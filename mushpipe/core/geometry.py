@@ -1,0 +1,139 @@
+"""The camera model and rotations.
+
+Lens distortion is the Brown-Conrady polynomial (Brown 1966) with coefficients
+``k1 k2 p1 p2 k3``. The model ``brown_conrady`` applies it on the way into the image;
+``inverse_brown_conrady``, which Intel uses for SR300 depth, on the way out of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def brown(xy: Array, coefficients: tuple[float, ...]) -> Array:
+    """Apply the Brown-Conrady polynomial to normalised image coordinates.
+
+    Args:
+        xy: (..., 2) coordinates on the plane z = 1.
+        coefficients: ``k1 k2 p1 p2 k3``.
+
+    Returns:
+        (..., 2) distorted coordinates.
+    """
+    k1, k2, p1, p2, k3 = coefficients
+    x, y = xy[..., 0], xy[..., 1]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return np.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
+        ],
+        axis=-1,
+    )
+
+
+def brown_inverse(xy: Array, coefficients: tuple[float, ...], iterations: int = 60) -> Array:
+    """Undo `brown` by Gauss-Newton with a numeric Jacobian.
+
+    Points where no pre-image is found to 1e-7 become NaN: a lens model is only valid inside
+    the image it was fitted on, and a wrong ray must not pass for a right one.
+    """
+    guess = xy.copy()
+    step = 1e-6
+    with np.errstate(all="ignore"):
+        for _ in range(iterations):
+            error = brown(guess, coefficients) - xy
+            if np.nanmax(np.abs(error), initial=0.0) < 1e-12:
+                break
+            columns = [
+                (brown(guess + d, coefficients) - brown(guess - d, coefficients)) / (2 * step)
+                for d in step * np.eye(2)
+            ]
+            (a, c), (b, d) = (np.moveaxis(column, -1, 0) for column in columns)
+            ex, ey = error[..., 0], error[..., 1]
+            update = np.stack([d * ex - b * ey, a * ey - c * ex], axis=-1)
+            guess = guess - update / (a * d - b * c)[..., None]
+        bad = ~(np.abs(brown(guess, coefficients) - xy).max(axis=-1) < 1e-7)
+    guess[bad] = np.nan
+    return guess
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera with lens distortion; lengths in px.
+
+    Attributes:
+        width: Image width.
+        height: Image height.
+        fx: Focal length along x.
+        fy: Focal length along y.
+        cx: Principal point, x; the centre of the first pixel is 0.
+        cy: Principal point, y.
+        model: ``none``, ``brown_conrady`` or ``inverse_brown_conrady``.
+        coefficients: ``k1 k2 p1 p2 k3``, empty for ``none``.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    model: str = "none"
+    coefficients: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not (self.width > 0 and self.height > 0 and self.fx > 0 and self.fy > 0):
+            raise ValueError(f"size and focal length of a camera must be positive: {self}")
+        expected = {"none": 0, "brown_conrady": 5, "inverse_brown_conrady": 5}.get(self.model)
+        if len(self.coefficients) != expected:
+            raise ValueError(
+                f"camera model '{self.model}' with {len(self.coefficients)} coefficients; "
+                "expected none, or (inverse_)brown_conrady with k1 k2 p1 p2 k3"
+            )
+
+    def project(self, points: Array) -> Array:
+        """Project (..., 3) points in metres to (..., 2) pixels; NaN behind the camera."""
+        points = np.asarray(points, dtype=np.float64)
+        z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
+        xy = points[..., :2] / z[..., None]
+        if self.model == "brown_conrady":
+            xy = brown(xy, self.coefficients)
+        elif self.model == "inverse_brown_conrady":
+            xy = brown_inverse(xy, self.coefficients)
+        return np.asarray(xy * (self.fx, self.fy) + (self.cx, self.cy))
+
+    def deproject(self, pixels: Array, depth: Array) -> Array:
+        """Lift (..., 2) pixels at (...,) depths (z in metres) to (..., 3) points."""
+        xy = (np.asarray(pixels, dtype=np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
+        if self.model == "brown_conrady":
+            xy = brown_inverse(xy, self.coefficients)
+        elif self.model == "inverse_brown_conrady":
+            xy = brown(xy, self.coefficients)
+        z = np.asarray(depth, dtype=np.float64)[..., None]
+        return np.concatenate([xy * z, z], axis=-1)
+
+
+def quaternion_from_axis(axis: Array) -> Array:
+    """Return the shortest rotations that take +z to the given unit axes.
+
+    Args:
+        axis: (N, 3) unit vectors; rows of NaN stay NaN.
+
+    Returns:
+        (N, 4) quaternions x y z w with w >= 0 and no spin about z. An axis of exactly -z has no
+        shortest rotation; half a turn about x is returned for it.
+    """
+    x, y, z = axis[:, 0], axis[:, 1], axis[:, 2]
+    # q = (z_hat x axis, 1 + z_hat . axis), normalised
+    q = np.stack([-y, x, np.zeros_like(x), 1 + z], axis=1)
+    opposite = z < -1 + 1e-12
+    q[opposite] = [1.0, 0.0, 0.0, 0.0]
+    norm = np.linalg.norm(q, axis=1, keepdims=True)
+    return np.asarray(q / norm, dtype=np.float64)

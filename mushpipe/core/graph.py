@@ -1,0 +1,205 @@
+"""A graph file compiled to a checked `Plan`, with every fault of the file reported at once."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from mushpipe.core.document import Document, Location
+from mushpipe.core.errors import GraphError, PluginError, Problem, suggest
+from mushpipe.core.overrides import apply_override
+from mushpipe.core.plan import Node, Plan
+from mushpipe.core.plugins import Registry
+from mushpipe.core.stage import Kind, Plugin, ports_of
+from mushpipe.core.wiring import wire
+
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
+
+
+class GraphFile(BaseModel):
+    """The keys of a graph file."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    mushpipe: Literal[1] = Field(description="version of the graph format")
+    description: str = Field("", description="what the graph is for")
+    seed: int = Field(0, ge=0, description="seed of every stage that wants randomness")
+    on_error: Literal["fail", "skip"] | None = Field(
+        None, description="when a stage fails: end the run (default in replay) or skip (live)"
+    )
+    max_failures: int = Field(10, ge=1, description="end a skipping run after so many in a row")
+    source: dict[str, Any] = Field(description="where frames come from")
+    stages: dict[str, dict[str, Any]] = Field({}, description="what happens to them, in order")
+    sinks: dict[str, dict[str, Any]] = Field({}, description="where results go")
+
+
+def compile_document(
+    document: Document,
+    registry: Registry,
+    overrides: Iterable[str | tuple[str, str]] = (),
+    source: str | None = None,
+) -> Plan:
+    """Compile a parsed graph.
+
+    Args:
+        document: The parsed file; overrides are worked into it.
+        registry: The plugins it may use.
+        overrides: ``a.b=value`` texts, each alone or with the label that messages call it by.
+        source: A recording or the name of a source plugin, put in place of the graph's own.
+
+    Raises:
+        GraphError: With every problem found.
+    """
+    problems: list[Problem] = []
+    if source is not None:
+        _replace_source(document, source, registry)
+    for item in overrides:
+        text, label = (item, "") if isinstance(item, str) else item
+        problems += apply_override(document, text, label)
+    try:
+        graph = GraphFile.model_validate_json(json.dumps(document.data), strict=True)
+    except ValidationError as error:
+        raise GraphError(
+            [*problems, *_translate(document, (), error, list(GraphFile.model_fields))]
+        ) from error
+    problems += _check_names(document, graph)
+    nodes = {
+        kind: [_node(document, registry, kind, at, settings, problems) for at, settings in entries]
+        for kind, entries in _entries(graph).items()
+    }
+    complete = [node for group in nodes.values() for node in group if node is not None]
+    if len(complete) == sum(map(len, nodes.values())):
+        problems += wire(document, registry, complete)
+    if problems:
+        raise GraphError(problems)
+    return Plan(
+        file=document.file,
+        source=complete[0],
+        stages=tuple(node for node in complete if node.kind == "stage"),
+        sinks=tuple(node for node in complete if node.kind == "sink"),
+        seed=graph.seed,
+        on_error=graph.on_error,
+        max_failures=graph.max_failures,
+        overrides=tuple(document.overrides.values()),
+        warnings=tuple(document.warnings),
+    )
+
+
+def _entries(graph: GraphFile) -> dict[Kind, list[tuple[Location, dict[str, Any]]]]:
+    return {
+        "source": [(("source",), graph.source)],
+        "stage": [(("stages", name), settings) for name, settings in graph.stages.items()],
+        "sink": [(("sinks", name), settings) for name, settings in graph.sinks.items()],
+    }
+
+
+def _replace_source(document: Document, source: str, registry: Registry) -> None:
+    is_name = ("source", source) in registry.entries and not Path(source).exists()
+    given = {"use": source} if is_name else {"use": "mcap", "path": source}
+    old = document.data.get("source")
+    if isinstance(old, dict) and old.get("use") == given["use"]:
+        given = {**old, **given}
+    document.data["source"] = given
+    label = f"--source {source}"
+    document.overrides[("source",)] = label
+    for key in ("use", "path"):
+        if key in given:
+            document.overrides[("source", key)] = label
+
+
+def _check_names(document: Document, graph: GraphFile) -> list[Problem]:
+    problems = []
+    for section, names in (("stages", graph.stages), ("sinks", graph.sinks)):
+        for name in names:
+            message = ""
+            if not _NAME.fullmatch(name):
+                message = f"'{name}' is no name: letters, digits, - and _, beginning with a letter"
+            elif name in GraphFile.model_fields:
+                message = f"'{name}' is a key of the graph file and cannot name a stage or sink"
+            elif section == "sinks" and name in graph.stages:
+                message = f"a stage is called '{name}' already"
+            if message:
+                problems.append(document.problem((section, name), message, key=True))
+    return problems
+
+
+def _node(
+    document: Document,
+    registry: Registry,
+    kind: Kind,
+    at: Location,
+    entry: dict[str, Any],
+    problems: list[Problem],
+) -> Node | None:
+    settings = {k: v for k, v in entry.items() if k not in ("use", "inputs", "delivery")}
+    use, inputs, delivery = entry.get("use"), entry.get("inputs", {}), entry.get("delivery")
+    if not isinstance(use, str):
+        problems.append(document.problem(at, f"needs 'use': the name of a {kind}", key=True))
+        return None
+    if not isinstance(inputs, dict) or not all(isinstance(v, str) for v in inputs.values()):
+        problems.append(document.problem((*at, "inputs"), "expected {parameter: stage name}"))
+        return None
+    if delivery not in ((None, "every", "latest") if kind == "sink" else (None,)):
+        problems.append(
+            document.problem((*at, "delivery"), "expected 'every' or 'latest', on a sink")
+        )
+        return None
+    base = Path.cwd() if (*at, "use") in document.overrides else document.base
+    try:
+        plugin_class = registry.find(kind, use, base)
+        ports = ports_of(plugin_class)
+    except PluginError as error:
+        problems.append(document.problem((*at, "use"), str(error)))
+        return None
+    if (*at, "use") in document.overrides:
+        settings = _drop_foreign(document, at, use, plugin_class, settings)
+        inputs = {k: v for k, v in inputs.items() if k in {port.name for port in ports.inputs}}
+    try:
+        plugin = plugin_class.model_validate_json(
+            json.dumps(settings),
+            strict=True,
+            context={"base": document.base.absolute(), "from_shell": document.from_shell(at)},
+        )
+    except ValidationError as error:
+        problems += _translate(document, at, error, list(plugin_class.model_fields), use)
+        return None
+    if ".py:" in use:
+        use = str((base / use).resolve())
+    return Node(str(at[-1]), kind, use, plugin, ports, dict(inputs), delivery)
+
+
+def _drop_foreign(
+    document: Document, at: Location, use: str, plugin: type[Plugin], settings: dict[str, Any]
+) -> dict[str, Any]:
+    """Drop the settings a swapped-in plugin does not know, unless the command line set them."""
+    foreign = settings.keys() - plugin.model_fields.keys() - document.from_shell(at)
+    for key in sorted(foreign):
+        document.warnings.append(f"{at[-1]}: '{use}' has no setting '{key}'; it is dropped")
+    return {key: value for key, value in settings.items() if key not in foreign}
+
+
+def _translate(
+    document: Document, at: Location, error: ValidationError, known: list[str], use: str = ""
+) -> list[Problem]:
+    """Turn pydantic's errors into problems with places and suggestions."""
+    problems = []
+    of = f" of '{use}'" if use else ""
+    for item in error.errors():
+        path = (*at, *item["loc"])
+        name = str(item["loc"][-1]) if item["loc"] else ""
+        if item["type"] == "extra_forbidden":
+            what = f"unknown setting '{name}'{of}"
+            top = len(item["loc"]) == 1
+            problems.append(document.problem(path, what, suggest(name, known) if top else "", True))
+        elif item["type"] == "missing":
+            problems.append(document.problem(path[:-1], f"setting '{name}'{of} is missing"))
+        else:
+            given = json.dumps(item["input"], default=str)
+            message = f"{'.'.join(map(str, item['loc']))}{of}: {item['msg']}, got {given}"
+            problems.append(document.problem(path, message))
+    return problems

@@ -1,0 +1,59 @@
+"""What a run was made of, so that it can be repeated: graph, versions, recording, seed."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from mushpipe.core.plan import Plan
+from mushpipe.core.stage import RunInfo, Sink, Source
+
+_LIBRARIES = ("mushpipe", "numpy", "opencv-python-headless", "scikit-image", "scipy", "mcap")
+
+
+def build_manifest(plan: Plan) -> dict[str, Any]:
+    """Describe a run before it starts, as plain data without any wall-clock time."""
+    source = plan.source.plugin
+    files = source.files() if isinstance(source, Source) else ()
+    return {
+        "graph_file": plan.file,
+        "graph": plan.resolved(),
+        "overrides": list(plan.overrides),
+        "seed": plan.seed,
+        "recordings": [_describe(path) for path in files],
+        "versions": {"python": platform.python_version(), **_versions(plan)},
+    }
+
+
+def _describe(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        return {"file": path.name, "sha256": None, "bytes": None}
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return {"file": path.name, "sha256": digest, "bytes": path.stat().st_size}
+
+
+def _versions(plan: Plan) -> dict[str, str]:
+    nodes = (plan.source, *plan.stages, *plan.sinks)
+    packages = {type(node.plugin).__module__.partition(".")[0] for node in nodes}
+    found = {}
+    for name in sorted({*_LIBRARIES, *packages}):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def manifest_path(plan: Plan) -> Path:
+    """Return where a run's manifest goes: beside its first result file, else ``run.json``."""
+    source = plan.source.plugin
+    info = RunInfo(source.name() if isinstance(source, Source) else "", {})
+    for node in plan.sinks:
+        if isinstance(node.plugin, Sink):
+            for path in node.plugin.files(info):
+                return path.with_suffix(".run.json")
+    return Path("run.json")

@@ -1,0 +1,69 @@
+"""``--set a.b=value``: changing a graph from the command line."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import yaml
+
+from mushpipe.core.document import Document, Location
+from mushpipe.core.errors import Problem, suggest
+
+_TOP = ("seed", "on_error", "max_failures", "source", "stages", "sinks")
+
+
+def apply_override(document: Document, text: str, label: str = "") -> list[Problem]:
+    """Change the document as ``path=value`` says; return what is wrong with it.
+
+    The value is YAML. A path whose first part is no key of the graph file begins with the name
+    of a stage or sink: ``segment.mu=0.2`` is ``stages.segment.mu=0.2``. The label says in
+    messages where the change comes from.
+    """
+    label = label or f"--set {text}"
+    path, equals, value_text = text.partition("=")
+    if not equals:
+        return [Problem(label, 0, 0, "expected a.b=value")]
+    try:
+        value = yaml.safe_load(value_text)
+    except yaml.YAMLError:
+        value = value_text
+    at, message = _locate(document, path.strip())
+    if message:
+        return [Problem(label, 0, 0, message)]
+    target: Any = document.data
+    for depth, key in enumerate(at[:-1]):
+        target = target.setdefault(key, {})
+        if not isinstance(target, dict):
+            return [Problem(label, 0, 0, f"'{'.'.join(map(str, at[: depth + 1]))}' has no parts")]
+    target[at[-1]] = value
+    document.overrides[at] = label
+    return []
+
+
+def _locate(document: Document, path: str) -> tuple[Location, str]:
+    """Return the place a dotted path means, or a message why there is none."""
+    head, *rest = path.split(".")
+    sections = {
+        name: section for section in ("sinks", "stages") for name in _names(document, section)
+    }
+    if head in ("stages", "sinks"):
+        names = _names(document, head)
+        if not rest or rest[0] not in names:
+            name = rest[0] if rest else ""
+            return (), f"there is no '{name}' in {head}; {suggest(name, names)}"
+        head, *rest = rest
+        sections = dict.fromkeys(names, sections[head])
+    elif head in _TOP:
+        if head == "source" and not rest:
+            return (), "say which setting of the source: source.path=..., or use --source"
+        return (head, *rest), ""
+    if head not in sections:
+        return (), f"unknown path '{path}'; {suggest(head, [*sections, *_TOP])}"
+    if not rest:
+        return (), f"say which setting of '{head}': {head}.use=... for example"
+    return (sections[head], head, *rest), ""
+
+
+def _names(document: Document, section: str) -> list[str]:
+    entries = document.data.get(section)
+    return list(entries) if isinstance(entries, dict) else []

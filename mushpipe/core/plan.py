@@ -1,0 +1,88 @@
+"""A compiled graph: what runs, in which order, and who feeds whom."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, NamedTuple
+
+from mushpipe.core.stage import Kind, Plugin, Ports, Sink, Source
+
+
+class Link(NamedTuple):
+    """Where an input comes from: the producer's name and which of its outputs."""
+
+    producer: str
+    output: int
+
+
+@dataclass
+class Node:
+    """A configured plugin in a graph; ``links`` is filled by the wiring."""
+
+    name: str
+    kind: Kind
+    use: str
+    plugin: Plugin
+    ports: Ports
+    asked: dict[str, str] = field(default_factory=dict)
+    delivery: Literal["every", "latest"] | None = None
+    links: dict[str, Link] = field(default_factory=dict)
+
+    def resolved(self) -> dict[str, Any]:
+        """Return the node's entry in a graph file, with every setting written out."""
+        entry: dict[str, Any] = {"use": self.use, **self.plugin.model_dump(mode="json")}
+        if self.asked:
+            entry["inputs"] = self.asked
+        if self.delivery:
+            entry["delivery"] = self.delivery
+        return entry
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A graph that is ready to run."""
+
+    file: str
+    source: Node
+    stages: tuple[Node, ...]
+    sinks: tuple[Node, ...]
+    seed: int = 0
+    on_error: Literal["fail", "skip"] | None = None
+    max_failures: int = 10
+    overrides: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    def fresh(self) -> Plan:
+        """Return a plan whose plugins have no state yet."""
+
+        def copy(node: Node) -> Node:
+            return replace(node, plugin=node.plugin.model_copy(deep=True))
+
+        return replace(
+            self,
+            source=copy(self.source),
+            stages=tuple(map(copy, self.stages)),
+            sinks=tuple(map(copy, self.sinks)),
+        )
+
+    def resolved(self) -> dict[str, Any]:
+        """Return the graph as the data of a graph file, with every setting written out."""
+        return {
+            "mushpipe": 1,
+            "seed": self.seed,
+            "on_error": self.on_error,
+            "max_failures": self.max_failures,
+            "source": self.source.resolved(),
+            "stages": {node.name: node.resolved() for node in self.stages},
+            "sinks": {node.name: node.resolved() for node in self.sinks},
+        }
+
+    def replay(self) -> bool:
+        """Return whether the source can be played again."""
+        return not (isinstance(self.source.plugin, Source) and self.source.plugin.live)
+
+    def delivery(self, sink: Node) -> Literal["every", "latest"]:
+        """Return how a sink is fed; a replay never drops."""
+        if self.replay() or not isinstance(sink.plugin, Sink):
+            return "every"
+        return sink.delivery or sink.plugin.delivery

@@ -1,0 +1,224 @@
+"""Finding plugins: one entry-point group, one pluggy hook, each loaded in its own guard."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import sys
+import traceback
+import zlib
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from importlib.abc import Loader
+from importlib.machinery import ModuleSpec
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from types import ModuleType
+from typing import Any, cast
+
+import pluggy
+
+from mushpipe.core.errors import PluginError, suggest
+from mushpipe.core.stage import Kind, Plugin, kind_of
+
+GROUP = "mushpipe"
+hookspec = pluggy.HookspecMarker(GROUP)
+hookimpl = pluggy.HookimplMarker(GROUP)
+
+
+class _Hooks:
+    @hookspec
+    def mushpipe_register(self, registry: Registry) -> None:
+        """Register plugins by calling ``registry.stage(name, target)`` and its siblings."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A registered name. ``target`` is the class or ``"package.module:Class"``."""
+
+    kind: Kind
+    name: str
+    target: type[Plugin] | str
+    distribution: str
+    version: str
+
+    def load(self) -> type[Plugin]:
+        """Import the class.
+
+        Raises:
+            PluginError: It cannot be imported, or is of another kind.
+        """
+        where = f"{self.kind} '{self.name}' of {self.distribution} {self.version}"
+        try:
+            plugin = _import(self.target) if isinstance(self.target, str) else self.target
+        except Exception as error:
+            raise PluginError(f"{where} cannot be imported: {_brief(error)}") from error
+        if kind_of(plugin) != self.kind:
+            raise PluginError(f"{where} is a {kind_of(plugin)}, not a {self.kind}")
+        return plugin
+
+
+@dataclass(frozen=True)
+class Broken:
+    """An entry point that failed to load, with the reason."""
+
+    name: str
+    distribution: str
+    version: str
+    reason: str
+    details: str = ""
+
+
+@dataclass
+class Registry:
+    """The names a graph may use, and what failed while collecting them."""
+
+    entries: dict[tuple[Kind, str], list[Entry]] = field(default_factory=lambda: defaultdict(list))
+    broken: list[Broken] = field(default_factory=list)
+    _owner: tuple[str, str] = ("this process", "")
+
+    def stage(self, name: str, target: type[Plugin] | str) -> None:
+        """Register a stage; a ``"package.module:Class"`` is imported when a graph uses it."""
+        self._add("stage", name, target)
+
+    def source(self, name: str, target: type[Plugin] | str) -> None:
+        """Register a source."""
+        self._add("source", name, target)
+
+    def sink(self, name: str, target: type[Plugin] | str) -> None:
+        """Register a sink."""
+        self._add("sink", name, target)
+
+    def _add(self, kind: Kind, name: str, target: type[Plugin] | str) -> None:
+        self.entries[kind, name].append(Entry(kind, name, target, *self._owner))
+
+    def names(self, kind: Kind) -> list[str]:
+        """Return the registered names of one kind, sorted."""
+        return sorted(name for k, name in self.entries if k == kind)
+
+    def find(self, kind: Kind, use: str, base: Path) -> type[Plugin]:
+        """Return the class that ``use`` names.
+
+        Args:
+            kind: What is looked for.
+            use: A registered name, ``distribution:name``, or ``path/to/file.py:Class``.
+            base: Folder that a relative file path starts from.
+
+        Raises:
+            PluginError: Unknown, ambiguous, broken or of the wrong kind.
+        """
+        if ".py:" in use:
+            return _from_file(kind, use, base)
+        distribution, _, name = use.rpartition(":")
+        found = [
+            entry
+            for entry in self.entries.get((kind, name), [])
+            if distribution in ("", entry.distribution)
+        ]
+        if len(found) == 1:
+            return found[0].load()
+        if found:
+            raise PluginError(
+                f"{kind} '{name}' is provided by "
+                + " and ".join(f"{e.distribution} {e.version}" for e in found)
+                + f"; write '{found[0].distribution}:{name}' or '{found[1].distribution}:{name}'"
+            )
+        raise PluginError(self._unknown(kind, use))
+
+    def _unknown(self, kind: Kind, use: str) -> str:
+        text = f"unknown {kind} '{use}'; {suggest(use, self.names(kind))}"
+        for other in ("stage", "source", "sink"):
+            if (other, use) in self.entries:
+                text = f"'{use}' is a {other}, not a {kind}"
+        for broken in self.broken:
+            text += (
+                f"\n    it may belong to {broken.distribution} {broken.version}, "
+                f"which failed to load: {broken.reason}"
+            )
+        return text
+
+
+def load_registry() -> Registry:
+    """Collect the plugins of all installed distributions.
+
+    ``MUSHPIPE_PLUGINS`` (a comma list of distributions, or empty) narrows them; the built-in ones
+    are always there.
+    """
+    registry = Registry()
+    found = sorted(entry_points(group=GROUP), key=lambda e: (_owner(e)[0] != GROUP, _owner(e)))
+    wanted = os.environ.get("MUSHPIPE_PLUGINS")
+    if wanted is not None:
+        keep = {GROUP, *wanted.split(",")}
+        found = [point for point in found if _owner(point)[0] in keep]
+    register(registry, found)
+    return registry
+
+
+def register(registry: Registry, points: Iterable[EntryPoint]) -> None:
+    """Load entry points into the registry; a failure becomes a row of ``registry.broken``."""
+    manager = pluggy.PluginManager(GROUP)
+    manager.add_hookspecs(_Hooks)
+    for point in points:
+        distribution, version = registry._owner = _owner(point)
+        before = sum(map(len, registry.entries.values()))
+        try:
+            module = point.load()
+            manager.register(module)
+            manager.check_pending()
+            others = manager.get_plugins() - {module}
+            manager.subset_hook_caller("mushpipe_register", others)(registry=registry)
+            if sum(map(len, registry.entries.values())) == before:
+                raise PluginError("it registers nothing: is @mushpipe.hookimpl missing?")
+        except Exception as error:
+            registry.broken.append(
+                Broken(point.name, distribution, version, _brief(error), traceback.format_exc())
+            )
+            if manager.has_plugin(point.value):
+                manager.unregister(name=point.value)
+
+
+def _owner(point: EntryPoint) -> tuple[str, str]:
+    return (point.dist.name, point.dist.version) if point.dist else ("an unknown package", "")
+
+
+def _brief(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}"
+
+
+def _import(target: str) -> Any:
+    module, _, name = target.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+def _from_file(kind: Kind, use: str, base: Path) -> type[Plugin]:
+    path_text, _, name = use.rpartition(":")
+    path = (base / path_text).resolve()
+    module = _module_of_file(path)
+    plugin = getattr(module, name, None)
+    if plugin is None:
+        values = vars(module).items()
+        known = [n for n, v in values if isinstance(v, type) and v.__module__ == module.__name__]
+        raise PluginError(f"{path} has no class '{name}'; {suggest(name, known)}")
+    if kind_of(plugin) != kind:
+        raise PluginError(f"{use} is a {kind_of(plugin)}, not a {kind}")
+    return plugin  # type: ignore[no-any-return]
+
+
+def _module_of_file(path: Path) -> ModuleType:
+    # Loaded once per process: two stages of one file must share the types it defines.
+    module_name = f"mushpipe_file_{zlib.crc32(str(path).encode()):08x}_{path.stem}"
+    if module_name in sys.modules:
+        return sys.modules[module_name]
+    if not path.is_file():
+        raise PluginError(f"there is no file {path}")
+    spec = importlib.util.spec_from_file_location(module_name, path)
+    module = importlib.util.module_from_spec(cast(ModuleSpec, spec))
+    sys.modules[module_name] = module
+    try:
+        cast(Loader, cast(ModuleSpec, spec).loader).exec_module(module)
+    except Exception as error:
+        del sys.modules[module_name]
+        raise PluginError(f"{path} cannot be imported: {_brief(error)}") from error
+    return module

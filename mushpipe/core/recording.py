@@ -1,0 +1,245 @@
+"""Reading and writing MCAP files; a damaged file is read as far as it goes."""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from operator import attrgetter
+from pathlib import Path
+from typing import NamedTuple
+
+from mcap.exceptions import InvalidMagic, McapError
+from mcap.reader import SeekingReader
+from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schema, Statistics
+from mcap.records import Message as McapMessage
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import CompressionType, Writer
+from zstandard import ZstdError
+
+from mushpipe.core import wire
+from mushpipe.core.errors import InputError
+from mushpipe.core.geometry import Camera
+from mushpipe.core.types import Header, RgbdFrame
+
+# What mcap's reader raises on bytes that are not what they claim to be.
+_GARBAGE = (McapError, ValueError, struct.error, ZstdError, RuntimeError, MemoryError, TypeError)
+MANIFEST = "mushpipe.manifest"
+SUMMARY = "mushpipe.summary"
+GRAPH = "mushpipe.graph"
+
+
+class Raw(NamedTuple):
+    """A message as it stands in the file."""
+
+    channel: Channel
+    schema: Schema | None
+    message: McapMessage
+
+
+@dataclass
+class Index:
+    """What a file holds, without its messages."""
+
+    channels: dict[str, Channel] = field(default_factory=dict)
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    counts: Counter[str] = field(default_factory=Counter)
+    start_ns: int = 0
+    end_ns: int = 0
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    attachments: list[str] = field(default_factory=list)
+
+    def schema_name(self, topic: str) -> str:
+        """Return the name of a topic's schema, empty where it has none."""
+        schema = self.schemas.get(self.channels[topic].schema_id)
+        return schema.name if schema else ""
+
+
+class RecordingReader:
+    """Reads an MCAP file from front to back, chunk by chunk, checking every CRC.
+
+    Messages come in file order, sorted by log time within a chunk. ``damage`` says afterwards,
+    in words, what could not be read.
+
+    Raises:
+        InputError: The file is missing, empty, or not MCAP at all.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.damage: list[str] = []
+        try:
+            with path.open("rb") as file:
+                magic = file.read(8)
+        except FileNotFoundError:
+            raise InputError(f"{path}: there is no such recording") from None
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+        if not magic:
+            raise InputError(f"{path}: the file is empty")
+        if magic != b"\x89MCAP0\r\n":
+            raise InputError(f"{path}: not an MCAP file (it begins with {magic!r})")
+
+    def messages(
+        self, topics: set[str] | None = None, start_ns: int = 0, end_ns: int | None = None
+    ) -> Iterator[Raw]:
+        """Yield the messages of some topics (default all) with start_ns <= log_time < end_ns."""
+        channels: dict[int, Channel] = {}
+        schemas: dict[int, Schema] = {}
+
+        def wanted(time: int) -> bool:
+            return time >= start_ns and (end_ns is None or time < end_ns)
+
+        def overlaps(chunk: Chunk) -> bool:
+            past = end_ns is not None and chunk.message_start_time >= end_ns
+            return chunk.message_end_time >= start_ns and not past
+
+        for record in self._records(overlaps):
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, McapMessage):
+                channel = channels.get(record.channel_id)
+                if channel is None:
+                    self._note("a message belongs to no channel")
+                elif wanted(record.log_time) and (topics is None or channel.topic in topics):
+                    yield Raw(channel, schemas.get(channel.schema_id), record)
+
+    def _records(self, wanted: Callable[[Chunk], bool]) -> Iterator[McapRecord]:
+        with self.path.open("rb") as file:
+            limit = self.path.stat().st_size
+            reader = StreamReader(file, emit_chunks=True, record_size_limit=limit)
+            try:
+                for record in reader.records:
+                    if not isinstance(record, Chunk):
+                        yield record
+                    elif wanted(record):
+                        yield from self._unpack(record)
+            except InvalidMagic:
+                self._note("its last bytes are missing")
+            except _GARBAGE:
+                self._note("it breaks off: the recorder did not close it, or bytes are missing")
+
+    def _unpack(self, chunk: Chunk) -> list[McapRecord]:
+        try:
+            if chunk.uncompressed_size > 2**32:
+                raise ValueError("implausible size")
+            records = breakup_chunk(chunk, validate_crc=True)
+        except _GARBAGE as error:
+            self._note(f"a chunk is corrupt ({error})")
+            return []
+        # Only messages move, and all to the end: a channel is always known before its messages.
+        messages = [r for r in records if isinstance(r, McapMessage)]
+        others = [r for r in records if not isinstance(r, McapMessage)]
+        return [*others, *sorted(messages, key=attrgetter("log_time"))]
+
+    def _note(self, text: str) -> None:
+        if text not in self.damage:
+            self.damage.append(text)
+
+    def index(self) -> Index:
+        """Return what the file holds; from its summary, or by reading it all if that is lost."""
+        try:
+            return self._index_from_summary()
+        except _GARBAGE:
+            return self._index_by_scan()
+
+    def _index_from_summary(self) -> Index:
+        with self.path.open("rb") as file:
+            reader = SeekingReader(file, record_size_limit=self.path.stat().st_size)
+            summary = reader.get_summary()
+            if summary is None or not isinstance(summary.statistics, Statistics):
+                raise ValueError("no summary")
+            counts: Counter[str] = Counter()
+            for channel_id, count in summary.statistics.channel_message_counts.items():
+                counts[summary.channels[channel_id].topic] += count
+            return Index(
+                channels={c.topic: c for c in summary.channels.values()},
+                schemas=dict(summary.schemas),
+                counts=counts,
+                start_ns=summary.statistics.message_start_time,
+                end_ns=summary.statistics.message_end_time,
+                metadata={m.name: m.metadata for m in reader.iter_metadata()},
+                attachments=[a.name for a in summary.attachment_indexes],
+            )
+
+    def _index_by_scan(self) -> Index:
+        index = Index()
+        topics: dict[int, str] = {}
+        for record in self._records(lambda _: True):
+            if isinstance(record, Schema):
+                index.schemas[record.id] = record
+            elif isinstance(record, Channel):
+                topics[record.id] = record.topic
+                index.channels[record.topic] = record
+            elif isinstance(record, McapMessage) and record.channel_id in topics:
+                if not index.counts:
+                    index.start_ns = record.log_time
+                index.counts[topics[record.channel_id]] += 1
+                index.start_ns = min(index.start_ns, record.log_time)
+                index.end_ns = max(index.end_ns, record.log_time)
+            elif isinstance(record, Metadata):
+                index.metadata[record.name] = record.metadata
+            elif isinstance(record, Attachment):
+                index.attachments.append(record.name)
+        return index
+
+
+class RecordingWriter:
+    """Writes an MCAP file of zstd chunks of 1 MiB with CRCs; a topic gets its channel on first use.
+
+    A killed process loses at most the open chunk.
+    """
+
+    def __init__(self, path: Path, metadata: Mapping[str, Mapping[str, str]]) -> None:
+        self._file = path.open("wb")
+        self._writer = Writer(self._file, compression=CompressionType.ZSTD, enable_crcs=True)
+        self._writer.start(profile="mushpipe", library="mushpipe")
+        self._schemas: dict[tuple[str, str], int] = {}
+        self._channels: dict[tuple[str, str, tuple[tuple[str, str], ...]], int] = {}
+        self._camera: Camera | None = None
+        for name, values in metadata.items():
+            self.metadata(name, values)
+
+    def metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Write a metadata record at this place of the file."""
+        self._writer.add_metadata(name, dict(values))
+
+    def frame(self, frame: RgbdFrame, jpeg_quality: int | None = None) -> None:
+        """Write colour, depth where the frame has it, and the calibration whenever it changes."""
+        header = frame.header
+        if frame.camera is not None and frame.camera != self._camera:
+            self._camera = frame.camera
+            self.write(wire.CAMERA_TOPIC, wire.encode_camera(frame.camera, header), header)
+        self.write(wire.COLOR_TOPIC, wire.encode_color(frame, jpeg_quality), header)
+        if frame.depth is not None:
+            self.write(wire.DEPTH_TOPIC, wire.encode_depth(frame), header)
+
+    def write(self, topic: str, message: wire.Message, header: Header) -> None:
+        """Write a message: publish time is sensor time, log time is the host's arrival time."""
+        self._writer.add_message(
+            self._channel(topic, message),
+            log_time=header.arrival_ns,
+            data=message.data,
+            publish_time=header.stamp_ns,
+            sequence=header.sequence,
+        )
+
+    def _channel(self, topic: str, message: wire.Message) -> int:
+        schema = message.schema
+        key = (topic, schema.name, tuple(sorted(message.metadata.items())))
+        if key not in self._channels:
+            schema_key = (schema.name, schema.encoding)
+            if schema_key not in self._schemas:
+                self._schemas[schema_key] = self._writer.register_schema(*schema_key, schema.data)
+            self._channels[key] = self._writer.register_channel(
+                topic, schema.message_encoding, self._schemas[schema_key], dict(message.metadata)
+            )
+        return self._channels[key]
+
+    def close(self) -> None:
+        """Write index and footer; the file is complete only after this."""
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._file.close()

@@ -1,0 +1,116 @@
+"""What a run did: the balance of its frames and the time its stages took."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any
+
+from mushpipe.core.errors import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_OK, MushpipeError
+
+
+class Durations:
+    """A histogram of durations with 1 % wide bins: constant memory however long the run."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.max_ns = 0
+        self._bins: Counter[int] = Counter()
+
+    def add(self, duration_ns: int) -> None:
+        """Count one duration."""
+        self.count += 1
+        self.max_ns = max(self.max_ns, duration_ns)
+        self._bins[round(100 * math.log(max(duration_ns, 1)))] += 1
+
+    def quantile_ms(self, q: float) -> float:
+        """Return the q-quantile in ms, within 1 %; NaN without data."""
+        rank, seen = q * (self.count - 1), 0
+        for key in sorted(self._bins):
+            seen += self._bins[key]
+            if seen > rank:
+                return min(math.exp(key / 100), self.max_ns) / 1e6
+        return math.nan
+
+    def summary(self) -> dict[str, float]:
+        """Return p50, p95 and max in ms."""
+        return {
+            "p50_ms": round(self.quantile_ms(0.5), 3),
+            "p95_ms": round(self.quantile_ms(0.95), 3),
+            "max_ms": round(self.max_ns / 1e6, 3),
+        }
+
+
+@dataclass
+class SinkReport:
+    """What became of the frames handed to one sink."""
+
+    handed: int = 0
+    consumed: int = 0
+    dropped: int = 0
+    failed: int = 0
+
+    def balanced(self) -> bool:
+        """Whether every frame is accounted for."""
+        return self.handed == self.consumed + self.dropped + self.failed
+
+
+@dataclass
+class RunReport:
+    """The result of a run.
+
+    ``read`` counts frames the source delivered, ``waiting`` those that were read ahead and never
+    looked at because the run ended early.
+    """
+
+    read: int = 0
+    waiting: int = 0
+    processed: int = 0
+    dropped: int = 0
+    failed: int = 0
+    source: dict[str, int] = field(default_factory=dict)
+    sinks: dict[str, SinkReport] = field(default_factory=dict)
+    durations: dict[str, Durations] = field(default_factory=dict)
+    elapsed_s: float = 0.0
+    interrupted: bool = False
+    error: MushpipeError | None = None
+    capsules: list[str] = field(default_factory=list)
+
+    @property
+    def frames_in(self) -> int:
+        """Frames that entered the pipeline."""
+        return self.read - self.waiting
+
+    def balanced(self) -> bool:
+        """Whether frames in = processed + dropped + failed, for the pipeline and every sink."""
+        closed = self.frames_in == self.processed + self.dropped + self.failed
+        return closed and all(sink.balanced() for sink in self.sinks.values())
+
+    @property
+    def exit_code(self) -> int:
+        """The program's exit code for this run."""
+        if self.error is not None:
+            return self.error.exit_code
+        if not self.balanced():
+            return EXIT_FAILED
+        return EXIT_INTERRUPTED if self.interrupted else EXIT_OK
+
+    def summary(self) -> dict[str, Any]:
+        """Return counts and timings as plain data."""
+        return {
+            "exit_code": self.exit_code,
+            "error": str(self.error) if self.error else None,
+            "frames": {
+                "in": self.frames_in,
+                "processed": self.processed,
+                "dropped": self.dropped,
+                "failed": self.failed,
+                "balanced": self.balanced(),
+            },
+            "source": self.source,
+            "sinks": {name: vars(sink) for name, sink in self.sinks.items()},
+            "stages": {name: d.summary() for name, d in self.durations.items()},
+            "elapsed_s": round(self.elapsed_s, 3),
+            "capsules": self.capsules,
+        }

@@ -1,0 +1,247 @@
+"""Running a plan: one synchronous loop, frame by frame, whose balance must close."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mushpipe.core.capsule import write_capsule
+from mushpipe.core.edges import SinkThread, SourceThread, failure
+from mushpipe.core.errors import MushpipeError, StageError
+from mushpipe.core.manifest import build_manifest
+from mushpipe.core.plan import Link, Node, Plan
+from mushpipe.core.report import Durations, RunReport
+from mushpipe.core.stage import Plugin, RunInfo, Sink, Source, Stage
+from mushpipe.core.types import Mask, RgbdFrame, Trace
+
+logger = logging.getLogger("mushpipe")
+Progress = Callable[[RunReport], None]
+SOURCE_PATIENCE_S = 5.0
+
+
+def run(
+    plan: Plan,
+    stop: threading.Event | None = None,
+    progress: Progress | None = None,
+    capsules: Path | None = None,
+) -> RunReport:
+    """Run a plan to the end of its source.
+
+    Args:
+        plan: What to run; it is not changed, every run works on fresh copies.
+        stop: Set it to end after the frame in work; the report then says ``interrupted``.
+        progress: Called after every frame.
+        capsules: Folder for failure capsules; None writes none.
+
+    Returns:
+        The report; a failure is in its ``error``, never raised.
+    """
+    runner = _Runner(plan.fresh(), stop or threading.Event(), progress, capsules)
+    started = time.monotonic()
+    try:
+        runner.run()
+    except MushpipeError as error:
+        runner.report.error = error
+    runner.report.elapsed_s = time.monotonic() - started
+    runner.report.interrupted = runner.interrupted
+    return runner.report
+
+
+class _Runner:
+    def __init__(
+        self, plan: Plan, stop: threading.Event, progress: Progress | None, capsules: Path | None
+    ) -> None:
+        self.plan = plan
+        self.stop = stop
+        self.progress = progress
+        self.capsules = capsules
+        self.report = RunReport(durations={node.name: Durations() for node in plan.stages})
+        on_error = plan.on_error or ("fail" if plan.replay() else "skip")
+        self.tolerance = plan.max_failures if on_error == "skip" else 1
+        self.interrupted = False
+
+    def run(self) -> None:
+        source = self.plan.source.plugin
+        if not isinstance(source, Source):
+            raise TypeError("the plan's source is not a Source")
+        info = RunInfo(source.name(), build_manifest(self.plan))
+        with ExitStack() as stack:
+            stack.enter_context(_opened(self.plan.source, lambda: None))
+            for node in self.plan.stages:
+                stack.enter_context(_opened(node, _opener(node)))
+            for node in self.plan.sinks:
+                stack.enter_context(_opened(node, _opener(node, info)))
+            threads = [self._sink_thread(node) for node in self.plan.sinks]
+            reader = SourceThread(self.plan.source, source, threading.Event())
+            try:
+                self._loop(reader, threads)
+            finally:
+                self._wind_up(reader, source, threads)
+            for thread in threads:
+                plugin = thread.node.plugin
+                if isinstance(plugin, Sink) and thread.error is None:
+                    with _named(thread.node):
+                        plugin.finish(self.report.summary())
+
+    def _sink_thread(self, node: Node) -> SinkThread:
+        return SinkThread(node, self.plan.delivery(node) == "latest", self.tolerance)
+
+    def _loop(self, reader: SourceThread, threads: list[SinkThread]) -> None:
+        for thread in (reader, *threads):
+            thread.start()
+        failures_in_a_row = 0
+        while not reader.box.finished and not any(thread.error for thread in threads):
+            if self.stop.is_set():
+                self.interrupted = True
+                return
+            frame = reader.box.get(timeout=0.1)
+            if frame is None:
+                continue
+            try:
+                trace = self._process(frame)
+            except StageError as error:
+                self.report.failed += 1
+                failures_in_a_row += 1
+                if failures_in_a_row >= self.tolerance:
+                    many = f" ({failures_in_a_row} frames in a row)" if self.tolerance > 1 else ""
+                    raise StageError(f"{error}{many}", error.exit_code) from error
+                logger.warning("%s; the frame is skipped", error)
+            else:
+                failures_in_a_row = 0
+                self.report.processed += 1
+                for thread in threads:
+                    thread.box.put((frame, _sink_inputs(thread.node, trace)))
+            self.report.read = reader.box.accepted
+            self.report.dropped = reader.box.dropped
+            if self.progress:
+                self.progress(self.report)
+
+    def _wind_up(self, reader: SourceThread, source: Source, threads: list[SinkThread]) -> None:
+        """Stop the threads, let the sinks finish what they were handed, and settle the counts."""
+        reader.stop.set()
+        reader.box.close()
+        for thread in threads:
+            thread.box.close()
+        for edge in (reader, *threads):
+            if edge.is_alive():
+                # A sink finishes what it was handed; a source may hang in a device.
+                edge.join(SOURCE_PATIENCE_S if edge is reader else None)
+        self.report.read = reader.box.accepted
+        self.report.dropped = reader.box.dropped
+        self.report.waiting = reader.box.waiting
+        self.report.source = source.counts()
+        self.report.error = reader.error
+        for thread in threads:
+            self.report.sinks[thread.node.name] = thread.report()
+            if thread.error is not None:
+                self.report.error = thread.error
+                if thread.failed_frame is not None:
+                    self._save_capsule(thread.node, thread.failed_frame, thread.error)
+
+    def _process(self, frame: RgbdFrame) -> Trace:
+        outputs: dict[str, tuple[Any, ...]] = {self.plan.source.name: (frame,)}
+        durations: dict[str, int] = {}
+        for node in self.plan.stages:
+            begin = time.perf_counter_ns()
+            try:
+                outputs[node.name] = self._call(node, frame, outputs)
+            except Exception as error:
+                failed = failure(node, frame.header.sequence, error)
+                if not isinstance(error, MushpipeError):
+                    self._save_capsule(node, frame, failed)
+                raise failed from error
+            durations[node.name] = time.perf_counter_ns() - begin
+            self.report.durations[node.name].add(durations[node.name])
+        return Trace(frame, outputs, durations)
+
+    def _call(
+        self, node: Node, frame: RgbdFrame, outputs: dict[str, tuple[Any, ...]]
+    ) -> tuple[Any, ...]:
+        arguments = {name: _follow(link, outputs) for name, link in node.links.items()}
+        if node.ports.wants_rng:
+            name_key = zlib.crc32(node.name.encode())
+            arguments["rng"] = np.random.default_rng(
+                [self.plan.seed, name_key, frame.header.sequence]
+            )
+        result = node.plugin.process(**arguments)  # type: ignore[attr-defined]
+        values = result if isinstance(result, tuple) else (result,)
+        _check_outputs(node, values, frame)
+        return values
+
+    def _save_capsule(self, node: Node, frame: RgbdFrame, error: Exception) -> None:
+        done = any(f"failure-{node.name}-" in path for path in self.report.capsules)
+        if self.capsules is None or done:
+            return
+        try:
+            path = write_capsule(self.capsules, self.plan, node, frame, str(error))
+        except OSError as trouble:
+            logger.warning("the failing frame could not be saved: %s", trouble)
+        else:
+            self.report.capsules.append(str(path))
+
+
+def _opener(node: Node, info: RunInfo | None = None) -> Callable[[], None]:
+    plugin = node.plugin
+    if isinstance(plugin, Sink) and info is not None:
+        return lambda: plugin.open(info)
+    return plugin.open if isinstance(plugin, Stage) else lambda: None
+
+
+@contextmanager
+def _named(node: Node) -> Iterator[None]:
+    """Say which plugin an error outside of a frame comes from."""
+    try:
+        yield
+    except MushpipeError:
+        raise
+    except Exception as error:
+        raise failure(node, None, error) from error
+
+
+@contextmanager
+def _opened(node: Node, opener: Callable[[], None]) -> Iterator[Plugin]:
+    try:
+        with _named(node):
+            opener()
+        yield node.plugin
+    except BaseException:
+        with suppress(Exception):  # the first error is the one to report
+            node.plugin.close()
+        raise
+    with _named(node):
+        node.plugin.close()
+
+
+def _follow(link: Link, outputs: dict[str, tuple[Any, ...]]) -> Any:
+    return outputs[link.producer][link.output]
+
+
+def _sink_inputs(node: Node, trace: Trace) -> dict[str, Any]:
+    inputs = {name: _follow(link, dict(trace.outputs)) for name, link in node.links.items()}
+    for port in node.ports.inputs:
+        if port.type is Trace:
+            inputs[port.name] = trace
+    return inputs
+
+
+def _check_outputs(node: Node, values: tuple[Any, ...], frame: RgbdFrame) -> None:
+    expected = node.ports.outputs
+    matches = len(values) == len(expected) and all(map(isinstance, values, expected))
+    if not matches:
+        raise TypeError(
+            f"it returned ({', '.join(type(v).__name__ for v in values)}), "
+            f"declared is ({', '.join(t.__name__ for t in expected)})"
+        )
+    height, width = frame.color.shape[:2]
+    for value in values:
+        if isinstance(value, Mask) and value.foreground.shape != (height, width):
+            shape = value.foreground.shape
+            raise ValueError(f"its mask is {shape[1]}x{shape[0]}, the frame {width}x{height}")

@@ -1,0 +1,51 @@
+"""JSON Schema of the graph file for this installation, so that editors complete and check it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mushpipe.core.errors import PluginError
+from mushpipe.core.graph import GraphFile
+from mushpipe.core.plugins import Registry
+from mushpipe.core.stage import Kind
+
+
+def graph_schema(registry: Registry) -> dict[str, Any]:
+    """Return the schema: per plugin, ``use`` selects the settings that may stand beside it."""
+    schema = GraphFile.model_json_schema()
+    properties = schema["properties"]
+    definitions: dict[str, Any] = {}
+    properties["source"] |= _one_of(registry, "source", definitions)
+    for key, kind in (("stages", "stage"), ("sinks", "sink")):
+        choice = _one_of(registry, kind, definitions)  # type: ignore[arg-type]
+        properties[key]["additionalProperties"] = choice
+    return {**schema, "$schema": "http://json-schema.org/draft-07/schema#", "$defs": definitions}
+
+
+def _one_of(registry: Registry, kind: Kind, definitions: dict[str, Any]) -> dict[str, Any]:
+    """A chain of if/then on ``use``: editors complete it better than oneOf."""
+    rules, names = [], []
+    for name in registry.names(kind):
+        try:
+            plugin = registry.entries[kind, name][0].load()
+        except PluginError:
+            continue
+        names.append(name)
+        own = plugin.model_json_schema(ref_template=f"#/$defs/{kind}.{name}.{{model}}")
+        for model, definition in own.pop("$defs", {}).items():
+            definitions[f"{kind}.{name}.{model}"] = definition
+        own["properties"] = {"use": {"const": name}, "inputs": {"type": "object"}} | own.get(
+            "properties", {}
+        )
+        if kind == "sink":
+            own["properties"]["delivery"] = {"enum": ["every", "latest"]}
+        condition = {"properties": {"use": {"const": name}}, "required": ["use"]}
+        rules.append({"if": condition, "then": own})
+    use = {"type": "string", "anyOf": [{"enum": names}, {"pattern": r"\.py:|:"}]}
+    return {
+        "type": "object",
+        "required": ["use"],
+        "properties": {"use": use},
+        "additionalProperties": True,
+        "allOf": rules,
+    }

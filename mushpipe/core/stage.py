@@ -1,0 +1,210 @@
+"""Stages, sources and sinks: settings as pydantic fields, ports as one typed signature."""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from inspect import Parameter, signature
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo
+
+from mushpipe.core.errors import PluginError
+from mushpipe.core.types import RgbdFrame
+
+Kind = Literal["stage", "source", "sink"]
+
+
+def _resolve(path: Path, info: ValidationInfo) -> Path:
+    context = info.context or {}
+    from_shell = info.field_name in context.get("from_shell", ())
+    return Path("" if from_shell else context.get("base", "")) / path
+
+
+GraphPath = Annotated[Path, AfterValidator(_resolve)]
+"""A path setting: relative to the graph file, or to the shell where the command line set it."""
+
+
+@dataclass(frozen=True)
+class RunInfo:
+    """What a sink is told when a run begins.
+
+    Attributes:
+        recording: Name of what is played, for file names.
+        manifest: Resolved graph, versions, recording and seed; plain data.
+    """
+
+    recording: str
+    manifest: Mapping[str, Any]
+
+    def path(self, template: Path) -> Path:
+        """Fill ``{recording}`` into a path and make its folder."""
+        path = Path(str(template).replace("{recording}", self.recording))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
+
+class Plugin(BaseModel):
+    """Base of all plugins: an immutable description whose fields are its settings.
+
+    State lives in private attributes only; every run works on a fresh copy.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    def close(self) -> None:
+        """Release what `open` took; also called after a failure, and after a failed `open`."""
+
+
+class Stage(Plugin):
+    """One step of the pipeline; subclasses add ``process``, whose signature is their ports."""
+
+    method: ClassVar[str] = "process"
+
+    def open(self) -> None:
+        """Load weights, compile kernels: once per run, before the first frame."""
+
+
+class Source(Plugin):
+    """Where frames come from."""
+
+    method: ClassVar[str] = "frames"
+    live: ClassVar[bool] = False
+
+    max_frames: int | None = Field(None, ge=1, description="stop after so many frames")
+
+    def name(self) -> str:
+        """Return a short name for file names."""
+        return type(self).__name__.lower()
+
+    def files(self) -> tuple[Path, ...]:
+        """Return the recordings it reads, for the manifest."""
+        return ()
+
+    def frames(self) -> Iterator[RgbdFrame]:
+        """Yield frames; raise InputError after the last good one where the input is damaged."""
+        raise NotImplementedError
+
+    def counts(self) -> dict[str, int]:
+        """Return what was lost or repaired on the way in, by a name people understand."""
+        return {}
+
+
+class ReplaySource(Source):
+    """A source that can be played again, at any speed, to the same frames."""
+
+    speed: float = Field(
+        0.0, ge=0, description="pace of the replay: 1 is real time, 0 as fast as possible"
+    )
+
+
+class Sink(Plugin):
+    """Where results go; subclasses add ``consume``, whose parameters are its inputs.
+
+    ``delivery`` says what happens when the sink is slower than a live pipeline: ``every`` blocks
+    it, ``latest`` keeps the newest frame and counts the others. A replay never drops.
+    """
+
+    method: ClassVar[str] = "consume"
+    delivery: ClassVar[Literal["every", "latest"]] = "every"
+
+    def open(self, run: RunInfo) -> None:
+        """Open files and sockets: once per run, before the first frame."""
+
+    def files(self, run: RunInfo) -> tuple[Path, ...]:
+        """Return the files it writes."""
+        del run
+        return ()
+
+    def finish(self, summary: Mapping[str, Any]) -> None:
+        """Take the run's counts and timings, after the last frame and before `close`."""
+
+
+@dataclass(frozen=True)
+class Port:
+    """An input: parameter name, type, and whether a graph must provide it."""
+
+    name: str
+    type: type
+    required: bool
+
+
+@dataclass(frozen=True)
+class Ports:
+    """Inputs and outputs of a plugin, read from its signature."""
+
+    inputs: tuple[Port, ...]
+    outputs: tuple[type, ...]
+    wants_rng: bool
+
+
+def kind_of(plugin: type) -> Kind:
+    """Return which of the three kinds a class is.
+
+    Raises:
+        PluginError: It is none of them.
+    """
+    kinds: tuple[tuple[type, Kind], ...] = ((Stage, "stage"), (Source, "source"), (Sink, "sink"))
+    for base, kind in kinds:
+        if isinstance(plugin, type) and issubclass(plugin, base):
+            return kind
+    raise PluginError(f"{plugin!r} is not a Stage, Source or Sink class")
+
+
+def ports_of(plugin: type[Plugin]) -> Ports:
+    """Read the ports of a plugin class from the annotations of its method.
+
+    Raises:
+        PluginError: The method is missing, or an annotation is missing or not a class.
+    """
+    if kind_of(plugin) == "source":
+        return Ports((), (RgbdFrame,), False)
+    name = getattr(plugin, "method")  # noqa: B009 - declared on Stage and Sink, not on Plugin
+    method = getattr(plugin, name, None)
+    if method is None:
+        raise PluginError(f"{plugin.__qualname__} has no method '{name}'")
+    try:
+        hints = typing.get_type_hints(method)
+    except NameError as error:
+        raise PluginError(f"{plugin.__qualname__}.{name}: unknown annotation: {error}") from error
+    inputs, wants_rng = [], False
+    for parameter in list(signature(method).parameters.values())[1:]:
+        port = _port(plugin, parameter, hints)
+        if port.type is np.random.Generator:
+            wants_rng = True
+        else:
+            inputs.append(port)
+    outputs = _outputs(plugin, hints) if kind_of(plugin) == "stage" else ()
+    return Ports(tuple(inputs), outputs, wants_rng)
+
+
+def _port(plugin: type[Plugin], parameter: Parameter, hints: dict[str, Any]) -> Port:
+    hint = hints.get(parameter.name)
+    required = parameter.default is Parameter.empty
+    members = typing.get_args(hint)
+    if isinstance(hint, UnionType) or typing.get_origin(hint) is typing.Union:
+        left = [member for member in members if member is not NoneType]
+        if len(left) == 1 and len(members) == 2:
+            hint, required = left[0], False
+    if not isinstance(hint, type) or parameter.kind is not Parameter.POSITIONAL_OR_KEYWORD:
+        raise PluginError(
+            f"{plugin.__qualname__}: parameter '{parameter.name}' must be annotated with one type"
+        )
+    return Port(parameter.name, hint, required)
+
+
+def _outputs(plugin: type[Plugin], hints: dict[str, Any]) -> tuple[type, ...]:
+    hint = hints.get("return")
+    outputs = typing.get_args(hint) if typing.get_origin(hint) is tuple else (hint,)
+    if not all(isinstance(t, type) and t is not NoneType for t in outputs):
+        raise PluginError(
+            f"{plugin.__qualname__}.process must be annotated with what it returns: "
+            "a type, or a tuple of types"
+        )
+    if len(set(outputs)) < len(outputs):
+        raise PluginError(f"{plugin.__qualname__}.process returns the same type twice")
+    return outputs

@@ -1,0 +1,217 @@
+"""The per-mushroom types: parallel arrays in which row ``i`` is the same mushroom everywhere.
+
+SI units, quaternions x y z w. NaN means *unknown*, and a check in each type keeps a number from
+standing where the value is declared missing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from enum import IntEnum, IntFlag
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+def locked(array: Any, dtype: Any) -> NDArray[Any]:
+    """Return the array as the given dtype, set read-only in place where no conversion is needed."""
+    result = np.asarray(array, dtype=dtype)
+    result.flags.writeable = False
+    return result
+
+
+def column(*shape: int, dtype: type = np.float64) -> Any:
+    """Declare a field of `Columns`: an array of shape (N, *shape) and the given dtype."""
+    return field(metadata={"shape": shape, "dtype": dtype})
+
+
+class Columns:
+    """Base of the per-mushroom types: every field made by `column` has the same length N.
+
+    Raises:
+        ValueError: A field has the wrong shape, lengths differ, or `check` objects.
+    """
+
+    def __post_init__(self) -> None:
+        length: int | None = None
+        for item in fields(self):  # type: ignore[arg-type]
+            if "shape" not in item.metadata:
+                continue
+            array = locked(getattr(self, item.name), item.metadata["dtype"])
+            shape = item.metadata["shape"]
+            if array.ndim != 1 + len(shape) or array.shape[1:] != shape:
+                expected = ", ".join(["N", *map(str, shape)])
+                raise ValueError(
+                    f"{type(self).__name__}.{item.name} has shape {array.shape}, "
+                    f"expected ({expected}{',' if not shape else ''})"
+                )
+            if length is not None and len(array) != length:
+                raise ValueError(
+                    f"{type(self).__name__}.{item.name} has {len(array)} rows, expected {length}"
+                )
+            length = len(array)
+            object.__setattr__(self, item.name, array)
+        self.check()
+
+    def check(self) -> None:
+        """Raise ValueError where values contradict each other; overridden by each type."""
+
+    def __len__(self) -> int:
+        first = next(f for f in fields(self) if "shape" in f.metadata)  # type: ignore[arg-type]
+        return len(getattr(self, first.name))
+
+    def _require(self, condition: NDArray[np.bool_] | np.bool_ | bool, text: str) -> None:
+        if not np.all(condition):
+            rows = np.flatnonzero(~np.asarray(condition))
+            raise ValueError(f"{type(self).__name__}: {text} (row {rows[0]})")
+
+
+class DepthSource(IntEnum):
+    """Where a depth value comes from."""
+
+    MISSING = 0
+    MEASURED = 1
+    NEIGHBOURS = 2
+
+
+class PickFlag(IntFlag):
+    """What a robot must know about a pick before it acts on it."""
+
+    DEPTH_MISSING = 1
+    DEPTH_ESTIMATED = 2
+    POSE_UNKNOWN = 4
+    AT_BORDER = 8
+
+
+def _known(values: Floats) -> NDArray[np.bool_]:
+    finite = np.isfinite(values)
+    return np.asarray(finite.all(axis=tuple(range(1, values.ndim))))
+
+
+@dataclass(frozen=True, eq=False)
+class Circles(Columns):
+    """Mushroom outlines in the image.
+
+    Attributes:
+        center: (N, 2) px, x then y; the centre of the first pixel is (0, 0).
+        radius: (N,) px.
+        score: (N,) 0..1, larger is more certain.
+    """
+
+    center: Floats = column(2)
+    radius: Floats = column()
+    score: Floats = column()
+
+    def check(self) -> None:
+        """Centres are finite, radii positive, scores within 0..1."""
+        self._require(_known(self.center), "the centre must be finite")
+        self._require((self.radius > 0) & np.isfinite(self.radius), "the radius must be positive")
+        self._require((self.score >= 0) & (self.score <= 1), "the score must be within 0..1")
+
+
+@dataclass(frozen=True, eq=False)
+class Locations(Columns):
+    """Where the mushrooms are, in the camera's optical frame.
+
+    Attributes:
+        position: (N, 3) m, the visible surface point at the circle's centre.
+        distance: (N,) m from the camera to that point.
+        diameter: (N,) m of the cap's outline.
+        source: (N,) `DepthSource` of the position.
+        sigma_position: (N, 3) m one sigma, NaN = not estimated.
+        sigma_diameter: (N,) m one sigma, NaN = not estimated.
+    """
+
+    position: Floats = column(3)
+    distance: Floats = column()
+    diameter: Floats = column()
+    source: NDArray[np.uint8] = column(dtype=np.uint8)
+    sigma_position: Floats = column(3)
+    sigma_diameter: Floats = column()
+
+    def check(self) -> None:
+        """A position is finite exactly where its source is not missing; sizes are positive."""
+        present = self.source != DepthSource.MISSING
+        self._require(_known(self.position) == present, "position must be NaN where missing")
+        self._require(_known(self.distance) == present, "distance must be NaN where missing")
+        self._require(~(self.diameter <= 0), "the diameter must be positive or NaN")
+
+
+@dataclass(frozen=True, eq=False)
+class Poses(Columns):
+    """Orientation of the caps; a cap's own frame has +z along the cap normal, free about z.
+
+    Attributes:
+        quaternion: (N, 4) x y z w, rotation of the cap's frame in the camera frame.
+        axis: (N, 3) unit cap normal pointing out of the cap.
+        apex: (N, 3) m, top of the cap on that axis.
+        sigma_rad: (N,) one-sigma uncertainty of the tilt.
+        fitness: (N,) 0..1, the method's own measure of fit.
+        valid: (N,) bool, False where the pose is unknown and its fields are NaN.
+    """
+
+    quaternion: Floats = column(4)
+    axis: Floats = column(3)
+    apex: Floats = column(3)
+    sigma_rad: Floats = column()
+    fitness: Floats = column()
+    valid: NDArray[np.bool_] = column(dtype=np.bool_)
+
+    def check(self) -> None:
+        """Quaternion, axis and apex are known exactly where valid; both former have length 1."""
+        for name in ("quaternion", "axis", "apex"):
+            known = _known(getattr(self, name))
+            self._require(known == self.valid, f"{name} must be finite exactly where valid")
+        for name in ("quaternion", "axis"):
+            norm = np.linalg.norm(getattr(self, name), axis=1)
+            self._require(~(np.abs(norm - 1) > 1e-6), f"{name} must have length 1")
+
+
+@dataclass(frozen=True, eq=False)
+class Picks(Columns):
+    """What the robot gets, row by row the circles that were detected.
+
+    Attributes:
+        id: (N,) stable while the mushroom is visible.
+        center: (N, 2) px, the circle the pick came from.
+        radius: (N,) px.
+        position: (N, 3) m, the apex where the pose is valid, else the surface point.
+        distance: (N,) m from the camera to the surface point.
+        diameter: (N,) m.
+        quaternion: (N, 4) x y z w.
+        axis: (N, 3) unit cap normal.
+        score: (N,) 0..1.
+        sigma_position: (N, 3) m one sigma.
+        sigma_diameter: (N,) m one sigma.
+        sigma_tilt: (N,) rad one sigma.
+        source: (N,) `DepthSource` of the position.
+        flags: (N,) `PickFlag` bits.
+        frame_id: The frame position, quaternion and axis are expressed in.
+    """
+
+    id: NDArray[np.int64] = column(dtype=np.int64)
+    center: Floats = column(2)
+    radius: Floats = column()
+    position: Floats = column(3)
+    distance: Floats = column()
+    diameter: Floats = column()
+    quaternion: Floats = column(4)
+    axis: Floats = column(3)
+    score: Floats = column()
+    sigma_position: Floats = column(3)
+    sigma_diameter: Floats = column()
+    sigma_tilt: Floats = column()
+    source: NDArray[np.uint8] = column(dtype=np.uint8)
+    flags: NDArray[np.uint32] = column(dtype=np.uint32)
+    frame_id: str = ""
+
+    def check(self) -> None:
+        """Ids are unique, and a pick without depth carries no position."""
+        self._require(len(np.unique(self.id)) == len(self.id), "ids must be unique")
+        present = self.source != DepthSource.MISSING
+        self._require(_known(self.position) == present, "position must be NaN where missing")
+        flagged = (self.flags & PickFlag.DEPTH_MISSING) != 0
+        self._require(flagged != present, "DEPTH_MISSING must be set exactly where missing")

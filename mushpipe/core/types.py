@@ -1,0 +1,140 @@
+"""What flows through a graph, per frame: images, masks and the trace of a frame.
+
+Frozen dataclasses, checked and locked on construction. The per-mushroom types stand in `tables`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mushpipe.core.geometry import Camera
+from mushpipe.core.tables import locked
+
+
+@dataclass(frozen=True)
+class Header:
+    """Where and when a frame was taken.
+
+    Attributes:
+        stamp_ns: Sensor time in ns since the epoch.
+        sequence: Number of the frame, from 0.
+        frame_id: An optical frame: x right, y down, z forward.
+        arrival_ns: Host time at which the frame arrived, ns since the epoch.
+    """
+
+    stamp_ns: int
+    sequence: int
+    frame_id: str
+    arrival_ns: int = 0
+
+    def __post_init__(self) -> None:
+        if not self.arrival_ns:
+            object.__setattr__(self, "arrival_ns", self.stamp_ns)
+
+
+@dataclass(frozen=True, eq=False)
+class RgbdFrame:
+    """One colour image with the depth image aligned to it.
+
+    Attributes:
+        header: Time, number and frame.
+        color: (H, W, 3) uint8 RGB.
+        depth: (H, W) uint16 or float32 in the sensor's unit, 0 = missing; None without depth.
+        depth_scale: Metres per unit of `depth`.
+        camera: Intrinsics of the colour image; None where the recording has none.
+    """
+
+    header: Header
+    color: NDArray[np.uint8]
+    depth: NDArray[Any] | None = None
+    depth_scale: float = 0.001
+    camera: Camera | None = None
+
+    def __post_init__(self) -> None:
+        color = locked(self.color, None)
+        if color.dtype != np.uint8 or color.ndim != 3 or color.shape[2] != 3 or not color.size:
+            raise ValueError(f"color is {color.dtype}{color.shape}, expected uint8 (H, W, 3)")
+        object.__setattr__(self, "color", color)
+        if self.depth is not None:
+            self._check_depth(locked(self.depth, None))
+        size = (self.camera.height, self.camera.width) if self.camera else color.shape[:2]
+        if size != color.shape[:2]:
+            raise ValueError(
+                f"the image is {color.shape[1]}x{color.shape[0]}, "
+                f"its calibration is for {size[1]}x{size[0]}"
+            )
+
+    def _check_depth(self, depth: NDArray[Any]) -> None:
+        if depth.dtype not in (np.uint16, np.float32):
+            raise ValueError(f"depth is {depth.dtype}, expected uint16 or float32")
+        if depth.shape != self.color.shape[:2]:
+            raise ValueError(
+                f"depth has shape {depth.shape}, colour {self.color.shape[:2]}: "
+                "depth must be aligned to colour"
+            )
+        if not self.depth_scale > 0:
+            raise ValueError(f"depth_scale is {self.depth_scale}, expected metres per unit > 0")
+        object.__setattr__(self, "depth", depth)
+
+    @cached_property
+    def gray(self) -> NDArray[np.float32]:
+        """(H, W) float32 luma (ITU-R BT.601) in 0..1, read-only."""
+        import cv2
+
+        luma = cv2.cvtColor(self.color, cv2.COLOR_RGB2GRAY)
+        return locked(luma * np.float32(1 / 255), np.float32)
+
+    @cached_property
+    def depth_m(self) -> NDArray[np.float32]:
+        """(H, W) float32 depth in metres, NaN = missing (everywhere without depth), read-only."""
+        if self.depth is None:
+            return locked(np.full(self.color.shape[:2], np.nan), np.float32)
+        metres = self.depth.astype(np.float32) * np.float32(self.depth_scale)
+        metres[~((metres > 0) & np.isfinite(metres))] = np.nan
+        return locked(metres, np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Mask:
+    """What is mushroom.
+
+    Attributes:
+        foreground: (H, W) bool.
+        initial: (H, W) bool, the contour the segmenter started from; None where it had none.
+    """
+
+    foreground: NDArray[np.bool_]
+    initial: NDArray[np.bool_] | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("foreground", "initial"):
+            value = getattr(self, name)
+            if value is None and name == "initial":
+                continue
+            array = locked(value, None)
+            if array.dtype != np.bool_ or array.shape != np.shape(self.foreground):
+                raise ValueError(f"Mask.{name} is {array.dtype}{array.shape}, expected bool (H, W)")
+            object.__setattr__(self, name, array)
+        if self.foreground.ndim != 2:
+            raise ValueError(f"Mask.foreground has {self.foreground.ndim} dimensions, expected 2")
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """All that happened to one frame; a sink that asks for it gets every stage's output.
+
+    Attributes:
+        frame: The frame as the source delivered it.
+        outputs: Per stage, in graph order, its outputs.
+        durations_ns: Per stage, the wall time it took.
+    """
+
+    frame: RgbdFrame
+    outputs: Mapping[str, tuple[Any, ...]]
+    durations_ns: Mapping[str, int]

@@ -1,0 +1,251 @@
+"""Types to messages and back: Foxglove protobuf for images and calibration, JSON for tables.
+
+A table becomes one JSON object with a column per field (NaN is null, floats are exact), described
+by a JSON Schema in the file, so that any MCAP tool can read it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import orjson
+
+from mushpipe.core import tables
+from mushpipe.core.geometry import Camera
+from mushpipe.core.tables import Columns
+from mushpipe.core.types import Header, Mask, RgbdFrame
+
+COLOR_TOPIC = "/camera/color/image_raw"
+DEPTH_TOPIC = "/camera/aligned_depth_to_color/image_raw"
+CAMERA_TOPIC = "/camera/color/camera_info"
+RESULT_PREFIX = "/mushpipe/"
+TIMING_TOPIC = "/mushpipe/timing"
+TABLES = {
+    f"mushpipe.{cls.__name__}": cls
+    for cls in (tables.Circles, tables.Locations, tables.Poses, tables.Picks)
+}
+
+
+@dataclass(frozen=True)
+class Schema:
+    """A message schema as MCAP wants it."""
+
+    name: str
+    encoding: str
+    data: bytes
+    message_encoding: str
+
+
+class Message(NamedTuple):
+    """An encoded value; ``suffix`` extends the topic where a value needs several messages."""
+
+    suffix: str
+    schema: Schema
+    data: bytes
+    metadata: Mapping[str, str] = {}
+
+
+Encoder = Callable[[Any, Header], Iterator[Message]]
+
+
+def encoder_of(kind: type) -> Encoder | None:
+    """Return the encoder of a port type, or None where it has no wire form."""
+    for known, encoder in _ENCODERS.items():
+        if issubclass(kind, known):
+            return encoder
+    return None
+
+
+@cache
+def _foxglove(name: str) -> Schema:
+    import foxglove.messages
+
+    schema = getattr(foxglove.messages, name).get_schema()
+    return Schema(schema.name, schema.encoding, schema.data, "protobuf")
+
+
+def _stamp(stamp_ns: int) -> Any:
+    from foxglove.messages import Timestamp
+
+    return Timestamp(sec=stamp_ns // 10**9, nsec=stamp_ns % 10**9)
+
+
+def encode_image(image: np.ndarray[Any, Any], encoding: str, header: Header) -> bytes:
+    """Encode an (H, W) or (H, W, C) array as foxglove.RawImage."""
+    from foxglove.messages import RawImage
+
+    return RawImage(
+        timestamp=_stamp(header.stamp_ns),
+        frame_id=header.frame_id,
+        width=image.shape[1],
+        height=image.shape[0],
+        encoding=encoding,
+        step=image[0].nbytes,
+        data=image.tobytes(),
+    ).encode()
+
+
+def encode_color(frame: RgbdFrame, jpeg_quality: int | None = None) -> Message:
+    """Encode the colour image, lossless or as JPEG."""
+    if jpeg_quality is None:
+        data = encode_image(frame.color, "rgb8", frame.header)
+        return Message("", _foxglove("RawImage"), data)
+    import cv2
+    from foxglove.messages import CompressedImage
+
+    _, buffer = cv2.imencode(
+        ".jpg", frame.color[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]
+    )
+    image = CompressedImage(
+        timestamp=_stamp(frame.header.stamp_ns),
+        frame_id=frame.header.frame_id,
+        data=buffer.tobytes(),
+        format="jpeg",
+    )
+    return Message("", _foxglove("CompressedImage"), image.encode())
+
+
+def encode_depth(frame: RgbdFrame) -> Message:
+    """Encode the depth image as the sensor gave it; its scale stands in the channel's metadata.
+
+    ``16UC1`` means millimetres to every viewer, so other 16-bit scales are called ``mono16``.
+    """
+    if frame.depth is None:
+        raise ValueError("the frame has no depth")
+    if frame.depth.dtype == np.float32:
+        encoding = "32FC1"
+    else:
+        encoding = "16UC1" if frame.depth_scale == 0.001 else "mono16"
+    data = encode_image(frame.depth, encoding, frame.header)
+    metadata = {"depth_scale": repr(float(frame.depth_scale))}
+    return Message("", _foxglove("RawImage"), data, metadata)
+
+
+def encode_camera(camera: Camera, header: Header) -> Message:
+    """Encode the intrinsics as foxglove.CameraCalibration."""
+    from foxglove.messages import CameraCalibration
+
+    k = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0]
+    message = CameraCalibration(
+        timestamp=_stamp(header.stamp_ns),
+        frame_id=header.frame_id,
+        width=camera.width,
+        height=camera.height,
+        distortion_model={"brown_conrady": "plumb_bob", "none": ""}.get(camera.model, camera.model),
+        D=list(camera.coefficients),
+        K=k,
+        R=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        P=[*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0],
+    )
+    return Message("", _foxglove("CameraCalibration"), message.encode())
+
+
+def _encode_frame(frame: RgbdFrame, header: Header) -> Iterator[Message]:
+    del header
+    yield encode_color(frame)._replace(suffix="/color")
+    if frame.depth is not None:
+        yield encode_depth(frame)._replace(suffix="/depth")
+
+
+def _encode_mask(mask: Mask, header: Header) -> Iterator[Message]:
+    for suffix, image in (("", mask.foreground), ("/initial", mask.initial)):
+        if image is not None:
+            pixels = image.view(np.uint8) * np.uint8(255)
+            yield Message(suffix, _foxglove("RawImage"), encode_image(pixels, "mono8", header))
+
+
+def _encode_table(table: Columns, header: Header) -> Iterator[Message]:
+    columns = {f.name: getattr(table, f.name) for f in fields(table)}  # type: ignore[arg-type]
+    yield json_message(table_schema(type(table)), header, columns)
+
+
+_ENCODERS: dict[type, Encoder] = {
+    RgbdFrame: _encode_frame,
+    Mask: _encode_mask,
+    Columns: _encode_table,
+}
+
+
+def json_message(schema: Schema, header: Header, content: Mapping[str, Any]) -> Message:
+    """Encode a JSON object with the frame's stamp, sequence and frame beside its content."""
+    body = {
+        "timestamp": {"sec": header.stamp_ns // 10**9, "nsec": header.stamp_ns % 10**9},
+        "sequence": header.sequence,
+        "frame_id": header.frame_id,
+        **content,
+    }
+    return Message("", schema, orjson.dumps(body, option=orjson.OPT_SERIALIZE_NUMPY))
+
+
+def json_schema(name: str, properties: Mapping[str, Any], title: str = "") -> Schema:
+    """Describe a message made by `json_message`."""
+    whole = {"type": "integer"}
+    document = {
+        "title": title or name,
+        "type": "object",
+        "properties": {
+            "timestamp": {"type": "object", "properties": {"sec": whole, "nsec": whole}},
+            "sequence": whole,
+            "frame_id": {"type": "string"},
+            **properties,
+        },
+    }
+    return Schema(name, "jsonschema", orjson.dumps(document), "json")
+
+
+def table_schema(table: type[Columns]) -> Schema:
+    """Return the schema of a table type, derived from its fields."""
+    properties: dict[str, Any] = {}
+    for item in fields(table):  # type: ignore[arg-type]
+        if "shape" not in item.metadata:
+            properties[item.name] = {"type": "string"}
+            continue
+        number = np.issubdtype(item.metadata["dtype"], np.floating)
+        kind = "boolean" if item.metadata["dtype"] is np.bool_ else "integer"
+        entry: dict[str, Any] = {"type": ["number", "null"] if number else kind}
+        for length in reversed(item.metadata["shape"]):
+            entry = {"type": "array", "items": entry, "minItems": length, "maxItems": length}
+        properties[item.name] = {"type": "array", "items": entry}
+    return json_schema(f"mushpipe.{table.__name__}", properties)
+
+
+TIMING = json_schema(
+    "mushpipe.Timing",
+    {"stages_ns": {"type": "object", "additionalProperties": {"type": "integer"}}},
+    "wall time of each stage; differs from run to run",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Decoded:
+    """A table read back, with the header of its frame."""
+
+    header: Header
+    table: Columns
+    topic: str = field(default="")
+
+
+def decode_table(schema_name: str, data: bytes, log_time: int = 0) -> Decoded | None:
+    """Read a table back; None where the schema is not one of ours.
+
+    Raises:
+        ValueError: The message does not fit its type.
+    """
+    cls = TABLES.get(schema_name)
+    if cls is None:
+        return None
+    body = orjson.loads(data)
+    stamp = body["timestamp"]["sec"] * 10**9 + body["timestamp"]["nsec"]
+    header = Header(stamp, body["sequence"], body["frame_id"], log_time)
+    values: dict[str, Any] = {}
+    for item in fields(cls):
+        value = body[item.name]
+        if "shape" in item.metadata:
+            value = np.array(value, dtype=item.metadata["dtype"])
+            value = value.reshape(-1, *item.metadata["shape"])
+        values[item.name] = value
+    return Decoded(header, cls(**values))

@@ -1,0 +1,109 @@
+"""Who feeds whom: an input takes the nearest producer of its type above it in the file."""
+
+from __future__ import annotations
+
+from mushpipe.core.document import Document
+from mushpipe.core.errors import PluginError, Problem, suggest
+from mushpipe.core.plan import Link, Node
+from mushpipe.core.plugins import Registry
+from mushpipe.core.stage import Port, ports_of
+from mushpipe.core.types import Trace
+
+
+def wire(document: Document, registry: Registry, nodes: list[Node]) -> list[Problem]:
+    """Fill the links of all nodes, given source first, then stages, then sinks, in file order.
+
+    An output that nobody takes becomes a warning of the document.
+    """
+    problems: list[Problem] = []
+    for position, node in enumerate(nodes):
+        above = [other for other in nodes[:position] if other.kind != "sink"]
+        unknown = node.asked.keys() - {port.name for port in node.ports.inputs}
+        for name in sorted(unknown):
+            at = (f"{node.kind}s", node.name, "inputs", name)
+            hint = suggest(name, [port.name for port in node.ports.inputs])
+            problems.append(document.problem(at, f"'{node.use}' has no input '{name}'", hint, True))
+        for port in node.ports.inputs:
+            if port.type is Trace and node.kind == "sink":
+                continue
+            problem = _connect(document, registry, node, port, above, nodes)
+            problems += [problem] if problem else []
+    if not problems:
+        _warn_unused(document, nodes)
+    return problems
+
+
+def _connect(
+    document: Document,
+    registry: Registry,
+    node: Node,
+    port: Port,
+    above: list[Node],
+    nodes: list[Node],
+) -> Problem | None:
+    wanted = node.asked.get(port.name)
+    for other in reversed(above):
+        if wanted in (None, other.name):
+            for index, produced in enumerate(other.ports.outputs):
+                if issubclass(produced, port.type):
+                    node.links[port.name] = Link(other.name, index)
+                    return None
+    at = (f"{node.kind}s", node.name)
+    if wanted is not None:
+        message = _why_not(node, port, wanted, above, nodes)
+        return document.problem((*at, "inputs", port.name), message)
+    if not port.required:
+        return None
+    message = f"nothing above '{node.name}' produces the {port.type.__name__} of its '{port.name}'"
+    return document.problem(at, message, _who_produces(registry, port), key=True)
+
+
+def _why_not(node: Node, port: Port, wanted: str, above: list[Node], nodes: list[Node]) -> str:
+    kind = port.type.__name__
+    names = [other.name for other in above]
+    if wanted in names:
+        return f"'{wanted}' does not produce {kind}"
+    if wanted == node.name:
+        return f"a cycle: '{wanted}' feeds itself"
+    below = {other.name: other for other in nodes if other.kind == "stage"}
+    if wanted in below:
+        feeds = node.name in _ancestors(below[wanted], nodes)
+        cycle = f"a cycle: {node.name} -> {wanted} -> {node.name}; " if feeds else ""
+        return f"{cycle}'{wanted}' stands below '{node.name}': the order of stages is the data flow"
+    return f"there is no stage '{wanted}'; {suggest(wanted, names)}"
+
+
+def _ancestors(node: Node, nodes: list[Node]) -> set[str]:
+    """Return the names of all nodes that can feed a node, by the types of their outputs."""
+    found: set[str] = set()
+    above = nodes[: nodes.index(node)]
+    for port in node.ports.inputs:
+        wanted = node.asked.get(port.name)
+        for other in reversed(above):
+            fits = any(issubclass(t, port.type) for t in other.ports.outputs)
+            if fits and wanted in (None, other.name):
+                found |= {other.name} | _ancestors(other, nodes)
+                break
+    return found
+
+
+def _who_produces(registry: Registry, port: Port) -> str:
+    """Return a hint that names the stages producing a type; only asked when one is missing."""
+    able = []
+    for name in registry.names("stage"):
+        for entry in registry.entries["stage", name]:
+            try:
+                outputs = ports_of(entry.load()).outputs
+            except PluginError:
+                continue
+            able += [name] if any(issubclass(t, port.type) for t in outputs) else []
+    return f"stages that produce {port.type.__name__}: {', '.join(able) or 'none installed'}"
+
+
+def _warn_unused(document: Document, nodes: list[Node]) -> None:
+    if any(port.type is Trace for node in nodes for port in node.ports.inputs):
+        return
+    used = {link.producer for node in nodes for link in node.links.values()}
+    for node in nodes:
+        if node.kind == "stage" and node.name not in used:
+            document.warnings.append(f"nobody takes what '{node.name}' produces")

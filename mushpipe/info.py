@@ -1,0 +1,147 @@
+"""What recordings hold and what plugins do, as text and as plain data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic_core import PydanticUndefined
+
+from mushpipe.core.errors import PluginError, suggest
+from mushpipe.core.plugins import Registry
+from mushpipe.core.recording import MANIFEST, RecordingReader
+from mushpipe.core.stage import Kind, Plugin, ports_of
+
+KINDS: tuple[Kind, ...] = ("source", "stage", "sink")
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """Read a recording to its end and describe it; ``damage`` is empty where it is whole.
+
+    Raises:
+        InputError: The file is missing, empty, or not MCAP at all.
+    """
+    reader = RecordingReader(path)
+    index = reader.index()
+    readable = dict.fromkeys(index.channels, 0)
+    for raw in reader.messages():
+        readable[raw.channel.topic] = readable.get(raw.channel.topic, 0) + 1
+    return {
+        "file": str(path),
+        "bytes": path.stat().st_size,
+        "start_ns": index.start_ns,
+        "duration_s": (index.end_ns - index.start_ns) / 1e9,
+        "topics": [
+            {"topic": topic, "schema": index.schema_name(topic), "messages": count}
+            for topic, count in sorted(readable.items())
+        ],
+        "attachments": index.attachments,
+        "results_of": index.metadata.get(MANIFEST, {}).get("json", ""),
+        "damage": reader.damage,
+    }
+
+
+def render(content: dict[str, Any]) -> str:
+    """Return `describe`'s data as text."""
+    lines = [
+        f"{content['file']}: {content['bytes'] / 1e6:.2f} MB, {content['duration_s']:.3f} s",
+        *_columns([(t["topic"], t["schema"], str(t["messages"])) for t in content["topics"]]),
+    ]
+    lines += [f"attachment {name}" for name in content["attachments"]]
+    lines += [f"damaged: {text}" for text in content["damage"]]
+    return "\n".join(lines)
+
+
+def _columns(rows: list[tuple[str, ...]], indent: str = "  ") -> list[str]:
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        (indent + "  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True))).rstrip()
+        for row in rows
+    ]
+
+
+def plugin_rows(registry: Registry) -> list[dict[str, str]]:
+    """Return one row per registered plugin and per broken one."""
+    rows = [
+        {
+            "kind": kind,
+            "name": name,
+            "from": f"{entry.distribution} {entry.version}".strip(),
+            "problem": "the name is taken twice" if len(registry.entries[kind, name]) > 1 else "",
+        }
+        for kind in KINDS
+        for name in registry.names(kind)
+        for entry in registry.entries[kind, name]
+    ]
+    rows += [
+        {
+            "kind": "broken",
+            "name": broken.name,
+            "from": f"{broken.distribution} {broken.version}".strip(),
+            "problem": broken.reason,
+        }
+        for broken in registry.broken
+    ]
+    return rows
+
+
+def render_plugins(rows: list[dict[str, str]]) -> str:
+    """Return the rows as a table."""
+    heading = ("kind", "name", "from", "problem")
+    return "\n".join(_columns([heading, *(tuple(row.values()) for row in rows)], ""))
+
+
+def describe_plugin(registry: Registry, name: str) -> str:
+    """Return help, ports and settings of every plugin of that name.
+
+    Raises:
+        PluginError: There is none.
+    """
+    if ".py:" in name:
+        classes = [(kind, _try(registry, kind, name)) for kind in KINDS]
+    else:
+        bare = name.rpartition(":")[2]
+        kinds = [kind for kind in KINDS if (kind, bare) in registry.entries]
+        classes = [(kind, registry.find(kind, name, Path.cwd())) for kind in kinds]
+    found = [_describe_class(kind, name, plugin) for kind, plugin in classes if plugin]
+    if not found:
+        known = sorted({n for kind in KINDS for n in registry.names(kind)})
+        raise PluginError(f"there is no plugin '{name}'; {suggest(name, known)}")
+    return "\n\n".join(found)
+
+
+def _try(registry: Registry, kind: Kind, name: str) -> type[Plugin] | None:
+    try:
+        return registry.find(kind, name, Path.cwd())
+    except PluginError as error:
+        if "not a" in str(error):
+            return None
+        raise
+
+
+def _describe_class(kind: Kind, name: str, plugin: type[Plugin]) -> str:
+    ports = ports_of(plugin)
+    inputs = [
+        f"{port.name}: {port.type.__name__}{'' if port.required else ' (optional)'}"
+        for port in ports.inputs
+    ]
+    outputs = [output.__name__ for output in ports.outputs]
+    lines = [f"{kind} {name}", "", (plugin.__doc__ or "").strip(), ""]
+    lines.append(f"inputs   {', '.join(inputs) or 'none'}")
+    lines.append(f"outputs  {', '.join(outputs) or 'none'}")
+    rows = [
+        (key, _annotation(field.annotation), _default(field), field.description or "")
+        for key, field in plugin.model_fields.items()
+    ]
+    if rows:
+        lines += ["", *_columns([("setting", "type", "default", "meaning"), *rows], "")]
+    return "\n".join(lines)
+
+
+def _annotation(annotation: Any) -> str:
+    text = annotation.__name__ if isinstance(annotation, type) else str(annotation)
+    return text.replace("typing.", "").replace("pathlib.", "").replace("mushpipe.sources.", "")
+
+
+def _default(field: Any) -> str:
+    return "required" if field.default is PydanticUndefined else str(field.default)

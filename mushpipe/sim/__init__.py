@@ -1,0 +1,1 @@
+"""The simulated mushroom bed behind the source `synthetic`."""

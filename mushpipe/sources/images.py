@@ -1,0 +1,159 @@
+"""Image messages to arrays: sensor_msgs and Foxglove, raw and compressed.
+
+Both families name the fields alike (``encoding``, ``width``, ``height``, ``step``, ``data``), so
+one decoder serves both.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mushpipe.core.geometry import Camera
+
+# encoding -> (bytes per pixel, order of its channels that gives RGB)
+_COLOR: dict[str, tuple[int, tuple[int, ...]]] = {
+    "rgb8": (3, (0, 1, 2)),
+    "8UC3": (3, (2, 1, 0)),
+    "bgr8": (3, (2, 1, 0)),
+    "rgba8": (4, (0, 1, 2)),
+    "bgra8": (4, (2, 1, 0)),
+    "8UC4": (4, (2, 1, 0)),
+    "mono8": (1, (0, 0, 0)),
+    "8UC1": (1, (0, 0, 0)),
+}
+_YUV = {"yuv422": "COLOR_YUV2RGB_UYVY", "uyvy": "COLOR_YUV2RGB_UYVY"} | dict.fromkeys(
+    ("yuv422_yuy2", "yuyv"), "COLOR_YUV2RGB_YUY2"
+)
+# encoding -> (dtype, metres per unit; None where the message cannot tell)
+_DEPTH: dict[str, tuple[str, float | None]] = {
+    "16UC1": ("u2", 0.001),
+    "mono16": ("u2", None),
+    "32FC1": ("f4", 1.0),
+}
+_PNG = b"\x89PNG"
+
+
+def is_depth_encoding(encoding: str) -> bool:
+    """Return whether an image of this encoding can be depth."""
+    return encoding in _DEPTH
+
+
+def _pixels(message: Any, item: int) -> NDArray[np.uint8]:
+    """Return the image's bytes as (H, W * item), without the padding at the end of its rows."""
+    height, width, step = message.height, message.width, message.step or message.width * item
+    data = np.frombuffer(message.data, np.uint8)
+    if not height or not width or step < width * item or len(data) < step * height:
+        raise ValueError(
+            f"{width}x{height} image with step {step} in {len(data)} bytes, "
+            f"{message.encoding} needs {item} bytes a pixel"
+        )
+    return data[: step * height].reshape(height, step)[:, : width * item]
+
+
+def decode_color(message: Any) -> NDArray[np.uint8]:
+    """Decode a raw or compressed colour image to (H, W, 3) uint8 RGB.
+
+    Raises:
+        ValueError: Unknown encoding, or the data do not fit the stated size.
+    """
+    if not hasattr(message, "encoding"):
+        return _decode_compressed_color(message)
+    if message.encoding in _YUV:
+        import cv2
+
+        rows = _pixels(message, 2).reshape(message.height, message.width, 2)
+        return np.asarray(cv2.cvtColor(rows, getattr(cv2, _YUV[message.encoding])), np.uint8)
+    if message.encoding not in _COLOR:
+        known = ", ".join([*_COLOR, *_YUV])
+        raise ValueError(f"colour encoding '{message.encoding}' is not known (known: {known})")
+    item, order = _COLOR[message.encoding]
+    image = _pixels(message, item).reshape(message.height, message.width, item)
+    return np.ascontiguousarray(
+        image if order == (0, 1, 2) == tuple(range(item)) else image[..., order]
+    )
+
+
+def _decode_compressed_color(message: Any) -> NDArray[np.uint8]:
+    import cv2
+
+    image = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        raise ValueError(f"compressed image ({message.format or 'no format'}) cannot be decoded")
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def decode_depth(message: Any, scale: float | None) -> tuple[NDArray[Any], float]:
+    """Decode a depth image to its native array and its scale in metres per unit.
+
+    Args:
+        message: Raw, or compressed as ROS compressedDepth or PNG.
+        scale: Metres per unit where the recording states it.
+
+    Raises:
+        ValueError: Unknown encoding, bad data, or a 16-bit image whose unit nobody states.
+    """
+    if not hasattr(message, "encoding"):
+        return _decode_compressed_depth(message, scale)
+    if message.encoding not in _DEPTH:
+        raise ValueError(
+            f"depth encoding '{message.encoding}' is not known (known: {', '.join(_DEPTH)})"
+        )
+    dtype, default = _DEPTH[message.encoding]
+    order = ">" if getattr(message, "is_bigendian", 0) else "<"
+    item = np.dtype(dtype).itemsize
+    native = np.dtype(dtype)
+    image = np.ascontiguousarray(_pixels(message, item)).view(order + dtype)
+    return image.astype(native, copy=False), _known_scale(scale, default, message.encoding)
+
+
+def _known_scale(scale: float | None, default: float | None, encoding: str) -> float:
+    known = scale if scale is not None else default
+    if known is None:
+        raise ValueError(f"{encoding} depth without a unit: set depth_scale (metres per unit)")
+    return known
+
+
+def _decode_compressed_depth(message: Any, scale: float | None) -> tuple[NDArray[Any], float]:
+    """Decode compressedDepth: a header of 12 bytes (enum, quantisation a and b) before a PNG."""
+    import cv2
+
+    data = bytes(message.data)
+    at = data.find(_PNG, 0, 16)
+    if at < 0:
+        raise ValueError(f"compressed depth '{message.format}' is not supported: only PNG is")
+    image = cv2.imdecode(np.frombuffer(data[at:], np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None or image.dtype != np.uint16 or image.ndim != 2:
+        raise ValueError(f"compressed depth '{message.format}' holds no 16-bit image")
+    if not message.format.startswith("32FC1"):
+        return image, _known_scale(scale, 0.001, "16UC1")
+    _, a, b = struct.unpack_from("<iff", data)
+    metres = np.zeros(image.shape, np.float32)
+    np.divide(np.float32(a), image - np.float32(b), out=metres, where=image > 0)
+    return metres, _known_scale(scale, 1.0, "32FC1")
+
+
+def decode_camera(message: Any) -> Camera | None:
+    """Decode CameraInfo or CameraCalibration; None where it says that it is not calibrated.
+
+    Raises:
+        ValueError: The distortion model is one that is not implemented.
+    """
+    k = list(message.k if hasattr(message, "k") else message.K)
+    d = [float(v) for v in (message.d if hasattr(message, "d") else message.D)]
+    if len(k) != 9 or not (k[0] > 0 and k[4] > 0):
+        return None
+    model: str = "none"
+    coefficients: tuple[float, ...] = ()
+    if any(d):
+        names = {"plumb_bob": "brown_conrady", "inverse_brown_conrady": "inverse_brown_conrady"}
+        if message.distortion_model not in names or len(d) != 5:
+            raise ValueError(
+                f"distortion model '{message.distortion_model}' with {len(d)} coefficients is not "
+                "supported (supported: plumb_bob with 5); rectify the images"
+            )
+        model, coefficients = names[message.distortion_model], tuple(d)
+    return Camera(message.width, message.height, k[0], k[4], k[2], k[5], model, coefficients)

@@ -1,0 +1,94 @@
+"""Which topics of a recording are colour, depth and calibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from mushpipe.core.errors import InputError, suggest
+from mushpipe.core.recording import Index
+from mushpipe.core.wire import RESULT_PREFIX
+
+IMAGES = {
+    "sensor_msgs/msg/Image",
+    "sensor_msgs/msg/CompressedImage",
+    "foxglove.RawImage",
+    "foxglove.CompressedImage",
+}
+CALIBRATIONS = {"sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration"}
+_TRANSPORTS = ("/compressedDepth", "/compressed")
+
+
+@dataclass(frozen=True)
+class Topics:
+    """The topics to read; depth and calibration may be absent."""
+
+    color: str
+    depth: str | None
+    camera: str | None
+
+
+def choose_topics(
+    index: Index, path: Path, color: str | None, depth: str | None, camera: str | None
+) -> Topics:
+    """Choose by schema and name; what the user names is taken as it is.
+
+    Names follow realsense2_camera: ``aligned_depth_to_color`` before any other depth, and the
+    ``camera_info`` beside the colour image.
+
+    Raises:
+        InputError: No colour images, several candidates, or a named topic is not there.
+    """
+    for wanted in (color, depth, camera):
+        if wanted is not None and wanted not in index.channels:
+            hint = suggest(wanted, sorted(index.channels))
+            raise InputError(f"{path}: there is no topic '{wanted}'; {hint}")
+    images = _topics(index, IMAGES)
+    color = color or _one(path, "color", _colors(images))
+    if color is None:
+        found = ", ".join(sorted(index.channels)) or "no topics at all"
+        raise InputError(f"{path}: it holds no colour images (it holds {found})")
+    depth = depth or _one(path, "depth", _depths(images))
+    return Topics(color, depth, camera or _calibration(index, path, color))
+
+
+def _topics(index: Index, schemas: set[str]) -> list[str]:
+    named = sorted(t for t in index.channels if index.schema_name(t) in schemas)
+    return [t for t in named if index.counts[t] and not t.startswith(RESULT_PREFIX)]
+
+
+def _colors(images: list[str]) -> list[str]:
+    others = [t for t in images if "depth" not in t.lower() and "infra" not in t.lower()]
+    named = [t for t in others if "color" in t.lower() or "rgb" in t.lower()]
+    return _without_transports(named or others)
+
+
+def _depths(images: list[str]) -> list[str]:
+    depths = [t for t in images if "depth" in t.lower()]
+    aligned = [t for t in depths if "aligned" in t.lower()]
+    return _without_transports(aligned or depths)
+
+
+def _without_transports(topics: list[str]) -> list[str]:
+    """Drop the compressed twin of a topic that is there raw."""
+    return [t for t in topics if _base(t) == t or _base(t) not in topics]
+
+
+def _base(topic: str) -> str:
+    for transport in _TRANSPORTS:
+        topic = topic.removesuffix(transport)
+    return topic
+
+
+def _calibration(index: Index, path: Path, color: str) -> str | None:
+    calibrations = _topics(index, CALIBRATIONS)
+    folder = _base(color).rpartition("/")[0]
+    beside = [t for t in calibrations if t.rpartition("/")[0] == folder]
+    return _one(path, "camera", beside or [t for t in calibrations if "depth" not in t.lower()])
+
+
+def _one(path: Path, role: str, candidates: list[str]) -> str | None:
+    if len(candidates) > 1:
+        options = " or ".join(f"--set source.{role}_topic={topic}" for topic in candidates)
+        raise InputError(f"{path}: several topics could be {role}; choose with {options}")
+    return candidates[0] if candidates else None
