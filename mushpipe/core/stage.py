@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ Kind = Literal["stage", "source", "sink"]
 def _resolve(path: Path, info: ValidationInfo) -> Path:
     context = info.context or {}
     from_shell = info.field_name in context.get("from_shell", ())
-    return Path("" if from_shell else context.get("base", "")) / path
+    return Path(os.path.normpath(Path("" if from_shell else context.get("base", "")) / path))
 
 
 GraphPath = Annotated[Path, AfterValidator(_resolve)]

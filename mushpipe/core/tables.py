@@ -17,8 +17,8 @@ Floats = NDArray[np.float64]
 
 
 def locked(array: Any, dtype: Any) -> NDArray[Any]:
-    """Return the array as the given dtype, set read-only in place where no conversion is needed."""
-    result = np.asarray(array, dtype=dtype)
+    """Return the array as C-contiguous dtype, read-only; itself where nothing needs converting."""
+    result = np.require(array, dtype, ["C_CONTIGUOUS"])
     result.flags.writeable = False
     return result
 

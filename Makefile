@@ -1,0 +1,57 @@
+# make demo   installs into .venv and finds mushrooms in a recording
+# make test   installs into .venv and runs lint, types and tests
+SHELL := /bin/bash
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.PHONY: demo test lint types unit test-slow recordings clean
+
+demo: $(STAMP)
+	$(BIN)/mushpipe run graphs/demo.yaml
+
+test: $(STAMP)-dev system-libraries lint types unit
+
+$(VENV)/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "mushpipe needs Python 3.11 or newer; set PYTHON=/path/to/python3.11"; exit 1; }
+	@$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
+	  if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+	    apt-get update -qq && apt-get install -y -qq python3-venv && $(PYTHON) -m venv $(VENV); \
+	  else echo "install python3-venv first: sudo apt-get install python3-venv"; exit 1; fi; }
+
+$(STAMP): $(VENV)/bin/python pyproject.toml
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable .
+	@touch $@
+
+$(STAMP)-dev: $(VENV)/bin/python pyproject.toml
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@touch $@ $(STAMP)
+
+# open3d needs libGL and libEGL; the tests that use it say so and are skipped without them.
+.PHONY: system-libraries
+system-libraries:
+	@ldconfig -p | grep -q libEGL.so.1 && ldconfig -p | grep -q 'libGL.so.1' || { \
+	  if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+	    apt-get update -qq && apt-get install -y -qq libegl1 libgl1 libusb-1.0-0 >/dev/null; \
+	  else echo "note: sudo apt-get install libegl1 libgl1 enables the open3d tests"; fi; }
+
+lint: $(STAMP)-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(STAMP)-dev
+	$(BIN)/mypy
+
+unit: $(STAMP)-dev
+	$(BIN)/pytest -m 'not slow'
+
+test-slow: $(STAMP)-dev system-libraries
+	$(BIN)/pytest -m slow
+
+recordings: $(STAMP)
+	$(BIN)/mushpipe record --source synthetic --frames 4 --out recordings/first-bed.mcap
+
+clean:
+	rm -rf $(VENV) out failures .mypy_cache .ruff_cache .pytest_cache
