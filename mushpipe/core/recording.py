@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from mcap.exceptions import InvalidMagic, McapError
 from mcap.reader import SeekingReader
@@ -216,6 +216,20 @@ class RecordingWriter:
         self.write(wire.COLOR_TOPIC, wire.encode_color(frame, jpeg_quality), header)
         if frame.depth is not None:
             self.write(wire.DEPTH_TOPIC, wire.encode_depth(frame), header)
+        for topic, value in frame.attached.items():
+            self.value(topic, value, header)
+
+    def value(self, topic: str, value: Any, header: Header) -> None:
+        """Write any value that has a wire form.
+
+        Raises:
+            TypeError: It has none.
+        """
+        encoder = wire.encoder_of(type(value))
+        if encoder is None:
+            raise TypeError(f"{type(value).__name__} has no wire form: it is no Columns type")
+        for message in encoder(value, header):
+            self.write(topic + message.suffix, message, header)
 
     def write(self, topic: str, message: wire.Message, header: Header) -> None:
         """Write a message: publish time is sensor time, log time is the host's arrival time."""

@@ -8,6 +8,7 @@ import time
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -147,7 +148,8 @@ class _Runner:
                     self._save_capsule(thread.node, thread.failed_frame, thread.error)
 
     def _process(self, frame: RgbdFrame) -> Trace:
-        outputs: dict[str, tuple[Any, ...]] = {self.plan.source.name: (frame,)}
+        seen = replace(frame, attached={})
+        outputs: dict[str, tuple[Any, ...]] = {self.plan.source.name: (seen,)}
         durations: dict[str, int] = {}
         for node in self.plan.stages:
             begin = time.perf_counter_ns()

@@ -18,6 +18,7 @@ from mushpipe.core.errors import PluginError
 from mushpipe.core.types import RgbdFrame
 
 Kind = Literal["stage", "source", "sink"]
+_METHODS: dict[Kind, str] = {"stage": "process", "source": "frames", "sink": "consume"}
 
 
 def _resolve(path: Path, info: ValidationInfo) -> Path:
@@ -64,8 +65,6 @@ class Plugin(BaseModel):
 class Stage(Plugin):
     """One step of the pipeline; subclasses add ``process``, whose signature is their ports."""
 
-    method: ClassVar[str] = "process"
-
     def open(self) -> None:
         """Load weights, compile kernels: once per run, before the first frame."""
 
@@ -73,7 +72,6 @@ class Stage(Plugin):
 class Source(Plugin):
     """Where frames come from."""
 
-    method: ClassVar[str] = "frames"
     live: ClassVar[bool] = False
 
     max_frames: int | None = Field(None, ge=1, description="stop after so many frames")
@@ -110,7 +108,6 @@ class Sink(Plugin):
     it, ``latest`` keeps the newest frame and counts the others. A replay never drops.
     """
 
-    method: ClassVar[str] = "consume"
     delivery: ClassVar[Literal["every", "latest"]] = "every"
 
     def open(self, run: RunInfo) -> None:
@@ -164,7 +161,7 @@ def ports_of(plugin: type[Plugin]) -> Ports:
     """
     if kind_of(plugin) == "source":
         return Ports((), (RgbdFrame,), False)
-    name = getattr(plugin, "method")  # noqa: B009 - declared on Stage and Sink, not on Plugin
+    name = _METHODS[kind_of(plugin)]
     method = getattr(plugin, name, None)
     if method is None:
         raise PluginError(f"{plugin.__qualname__} has no method '{name}'")

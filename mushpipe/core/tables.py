@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 
 def locked(array: Any, dtype: Any) -> NDArray[Any]:
     """Return the array as C-contiguous dtype, read-only; itself where nothing needs converting."""
-    result = np.require(array, dtype, ["C_CONTIGUOUS"])
+    result: NDArray[Any] = np.require(array, dtype, ["C_CONTIGUOUS"])
     result.flags.writeable = False
     return result
 

@@ -6,7 +6,7 @@ Frozen dataclasses, checked and locked on construction. The per-mushroom types s
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -48,6 +48,8 @@ class RgbdFrame:
         depth: (H, W) uint16 or float32 in the sensor's unit, 0 = missing; None without depth.
         depth_scale: Metres per unit of `depth`.
         camera: Intrinsics of the colour image; None where the recording has none.
+        attached: What else is known of this moment, by topic, and recorded beside the images; the
+            truth of a simulator, say. Stages never see it.
     """
 
     header: Header
@@ -55,6 +57,7 @@ class RgbdFrame:
     depth: NDArray[Any] | None = None
     depth_scale: float = 0.001
     camera: Camera | None = None
+    attached: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         color = locked(self.color, None)

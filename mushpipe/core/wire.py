@@ -17,6 +17,7 @@ import orjson
 from mushpipe.core import tables
 from mushpipe.core.geometry import Camera
 from mushpipe.core.tables import Columns
+from mushpipe.core.truth import Instances, Truth
 from mushpipe.core.types import Header, Mask, RgbdFrame
 
 COLOR_TOPIC = "/camera/color/image_raw"
@@ -26,7 +27,7 @@ RESULT_PREFIX = "/mushpipe/"
 TIMING_TOPIC = "/mushpipe/timing"
 TABLES = {
     f"mushpipe.{cls.__name__}": cls
-    for cls in (tables.Circles, tables.Locations, tables.Poses, tables.Picks)
+    for cls in (tables.Circles, tables.Locations, tables.Poses, tables.Picks, Truth)
 }
 
 
@@ -158,6 +159,10 @@ def _encode_mask(mask: Mask, header: Header) -> Iterator[Message]:
             yield Message(suffix, _foxglove("RawImage"), encode_image(pixels, "mono8", header))
 
 
+def _encode_instances(instances: Instances, header: Header) -> Iterator[Message]:
+    yield Message("", _foxglove("RawImage"), encode_image(instances.labels, "mono16", header))
+
+
 def _encode_table(table: Columns, header: Header) -> Iterator[Message]:
     columns = {f.name: getattr(table, f.name) for f in fields(table)}  # type: ignore[arg-type]
     yield json_message(table_schema(type(table)), header, columns)
@@ -166,6 +171,7 @@ def _encode_table(table: Columns, header: Header) -> Iterator[Message]:
 _ENCODERS: dict[type, Encoder] = {
     RgbdFrame: _encode_frame,
     Mask: _encode_mask,
+    Instances: _encode_instances,
     Columns: _encode_table,
 }
 

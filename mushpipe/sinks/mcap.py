@@ -60,8 +60,7 @@ class McapSink(Sink):
             writer.write(wire.TIMING_TOPIC, message, frame.header)
 
     def _write(self, writer: RecordingWriter, stage: str, value: Any, trace: Trace) -> None:
-        encoder = wire.encoder_of(type(value))
-        if encoder is None:
+        if wire.encoder_of(type(value)) is None:
             if type(value) not in self._unknown:
                 self._unknown.add(type(value))
                 logger.warning(
@@ -69,11 +68,8 @@ class McapSink(Sink):
                 )
             return
         # Several outputs of one stage need several topics; the first keeps the stage's own.
-        outputs = trace.outputs[stage]
-        own = "" if value is outputs[0] else f"/{type(value).__name__.lower()}"
-        for message in encoder(value, trace.frame.header):
-            topic = f"{wire.RESULT_PREFIX}{stage}{own}{message.suffix}"
-            writer.write(topic, message, trace.frame.header)
+        own = "" if value is trace.outputs[stage][0] else f"/{type(value).__name__.lower()}"
+        writer.value(f"{wire.RESULT_PREFIX}{stage}{own}", value, trace.frame.header)
 
     def finish(self, summary: Mapping[str, Any]) -> None:
         """Write the run's counts at the end."""
