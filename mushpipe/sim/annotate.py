@@ -76,12 +76,12 @@ def annotate(
     owner = np.where(surface.outlined, surface.owner, -1)
     seen = np.bincount(owner[owner >= 0], minlength=len(world.mushrooms))
     numbers = np.flatnonzero(seen)
-    outlines = [outline_around(_projected(world, view, k)) for k in numbers]
+    outlines = [outline_around(_projected(world, view, k)) for k in numbers.tolist()]
     mushrooms = [world.mushrooms[k] for k in numbers]
     centers = np.array([o.center for o in outlines]).reshape(-1, 2)
     area = np.array([o.area for o in outlines])
     visible = np.minimum(seen[numbers] / area, 1.0) if len(numbers) else area
-    across = [_across(world, k) for k in numbers]
+    across = [_across(world, k) for k in numbers.tolist()]
     reasons = [
         _reason(m, o, float(v), view, largest_px)
         for m, o, v in zip(mushrooms, outlines, visible, strict=True)
@@ -121,7 +121,7 @@ def _reason(
 ) -> Ignore:
     """Return why a mushroom does not count; the first of several reasons."""
     w, h = view.camera.width, view.camera.height
-    inside = (-0.5 <= outline.center) & (outline.center < np.array([w, h]) - 0.5)
+    inside = (outline.center >= -0.5) & (outline.center < np.array([w, h]) - 0.5)
     if mushroom.kind == Kind.STUMP:
         return Ignore.CUT_STUMP
     if mushroom.axis[2] < UPRIGHT_COSINE:

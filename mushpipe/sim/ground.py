@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from mushpipe.sim.mesh import Material, Mesh, box, height_field, revolve, sheet
-from mushpipe.sim.noise import Floats, Singles, blurred, mix, smoothstep
+from mushpipe.sim.noise import Floats, Reals, Singles, blurred, mix, smoothstep
 from mushpipe.sim.planting import Area
 
 RIM_HEIGHT = 0.035
@@ -32,23 +32,23 @@ class Ground:
     albedo: Singles
     material: Material
 
-    def texels(self, points: Floats) -> tuple[Singles, Singles]:
+    def texels(self, points: Reals) -> tuple[Singles, Singles]:
         """Return the column and row (N,) of points (N, 2) m."""
         column = (points[:, 0] - self.area.x0) / self.texel
         row = (self.area.y1 - points[:, 1]) / self.texel
         return column.astype(np.float32), row.astype(np.float32)
 
-    def sample(self, layer: Singles, points: Floats) -> Singles:
+    def sample(self, layer: Singles, points: Reals) -> Singles:
         """Interpolate a layer (H, W[, C]) at points (N, 2) m; the border goes on outside."""
         column, row = self.texels(points)
         # remap holds at most 32767 rows: fold the list of points into a table
-        width = 4096
+        width = max(1, min(4096, len(column)))
         rest = -len(column) % width
-        table = [np.pad(axis, (0, rest)).reshape(-1, width) for axis in (column, row)]
-        found = cv2.remap(layer, *table, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        x, y = (np.pad(axis, (0, rest)).reshape(-1, width) for axis in (column, row))
+        found = cv2.remap(layer, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(found.reshape(-1, *layer.shape[2:])[: len(column)])
 
-    def height_at(self, points: Floats) -> Floats:
+    def height_at(self, points: Reals) -> Floats:
         """Return the height (N,) m at points (N, 2) m."""
         return np.asarray(self.sample(self.height, points), np.float64)
 
@@ -88,7 +88,8 @@ def soil(area: Area, texel: float, mycelium: float, rng: np.random.Generator) ->
     height = height + 0.0011 * np.sqrt(np.maximum(crumbs, 0)) + 0.0003 * noise(0.0008)
     tone = 0.30 * noise(0.0009) + 0.22 * noise(0.004) + 0.22 * noise(0.02) + 0.12 * crumbs
     red = 0.06 * noise(0.006)
-    base = np.array([0.026, 0.0225, 0.020], np.float32)
+    peat, clay = np.array([0.026, 0.022, 0.019]), np.array([0.021, 0.0225, 0.0245])
+    base = (peat + rng.uniform(0, 1) * (clay - peat)).astype(np.float32)
     tilt = np.stack([1 + red, np.ones(shape), 1 - red], axis=-1)
     albedo = (base * np.exp(tone)[..., None] * tilt).astype(np.float32)
     _fibres(albedo, texel, area, rng)
@@ -123,10 +124,10 @@ def _mycelium(
         return blurred(rng, shape, grain / texel)
 
     patch = smoothstep(1.9 - 1.2 * amount, 3.0 - 1.2 * amount, noise(0.02) + 0.7 * noise(0.006))
-    web = np.exp(-((noise(0.0012) / 0.35) ** 2)) + 0.6 * np.exp(-((noise(0.003) / 0.2) ** 2))
-    cover = patch * np.clip(0.12 + 0.75 * web + 0.25 * noise(0.002), 0, 1)
+    web = np.exp(-((noise(0.001) / 0.3) ** 2)) + np.exp(-((noise(0.003) / 0.15) ** 2))
+    cover = patch * np.clip(0.10 + 0.40 * web + 0.30 * noise(0.0025) + 0.12 * noise(0.0008), 0, 1)
     threads = np.zeros(shape, np.float32)
-    for _ in range(round(420 * amount * area.size)):
+    for _ in range(round(260 * amount * area.size)):
         steps = np.cumsum(rng.normal(0, 0.35, 30)) + rng.uniform(0, 2 * np.pi)
         path = np.cumsum(np.stack([np.cos(steps), np.sin(steps)], axis=-1), axis=0)
         start = rng.uniform((0, 0), shape[::-1])
@@ -147,9 +148,7 @@ def lump(rng: np.random.Generator, radius: float, rings: int, material: Material
     return sheet(ball * knobs * rng.uniform(0.7, 1.15, 3) * radius, material)
 
 
-def litter(
-    ground: Ground, area: Area, density: float, rng: np.random.Generator
-) -> list[Mesh]:
+def litter(ground: Ground, area: Area, density: float, rng: np.random.Generator) -> list[Mesh]:
     """Scatter clods and stones over a ground.
 
     Args:
@@ -189,8 +188,8 @@ def primordia(
         spot = area.draw(rng, 1)[0]
         if len(around) and rng.random() < 0.5:
             spot = around[rng.integers(len(around))] + rng.normal(0, 0.014, 2)
-        number = 1 + int(rng.exponential(6))
-        spread = 0.0016 * np.sqrt(number)
+        number = 1 + int(rng.exponential(8))
+        spread = 0.0012 * np.sqrt(number)
         places = spot + rng.normal(0, spread, (number, 2)) * rng.uniform(0.5, 1.6, 2)
         for place, z in zip(places, ground.height_at(places), strict=True):
             radius = float(np.clip(rng.gamma(2.0, 0.0006), 0.0004, 0.003))

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mushpipe.sim.material import Paint
 from mushpipe.sim.mesh import Ints
@@ -18,6 +19,7 @@ from mushpipe.sim.settings import SceneSettings
 from mushpipe.sim.world import World
 
 _REACH = 0.15  # m; what stands farther away shades nothing of the sky
+_PANEL = 2.5  # how much brighter the sky is overhead: it is a panel of lamps, not a dome
 _LIFT = 0.0004  # m; shadow rays start so far above their surface
 
 
@@ -65,22 +67,22 @@ def rig_for(settings: SceneSettings, rng: np.random.Generator) -> Rig:
     low = (0.75 * up * c, 0.75 * up * d, 0.45 * up + 0.05)
     if settings.light == "gradient":
         slope = 1.35 * s / up
-        return Rig(0.52, (_lamp(rng, front, 0.05, 0.48, 2),), (slope * c, slope * d))
+        return Rig(0.62, (_lamp(rng, front, 0.08, 0.40, 2),), (slope * c, slope * d))
     if settings.light == "side":
-        lamps = (_lamp(rng, front, 0.05, 0.42 * (1 - s), 2), _lamp(rng, low, 0.03, 1.05 * s, 3))
-        return Rig(0.55 - 0.33 * s, lamps)
+        lamps = (_lamp(rng, front, 0.08, 0.4 * (1 - s), 2), _lamp(rng, low, 0.03, 1.05 * s, 3))
+        return Rig(0.62 - 0.40 * s, lamps)
     if settings.light == "spot":
         beam = up * (1.2 - 0.85 * s)
-        return Rig(0.5 - 0.36 * s, (_lamp(rng, front, 0.03, 0.48 + 0.5 * s, 2, beam),))
+        return Rig(0.62 - 0.42 * s, (_lamp(rng, front, 0.03, 0.40 + 0.58 * s, 2, beam),))
     if settings.light == "harsh":
         flash = (0.05 * c, 0.05 * d, up)
-        lamps = (_lamp(rng, flash, 0.004, 0.45 + 0.55 * s, 1), _lamp(rng, low, 0.01, 0.6 * s, 1))
+        lamps = (_lamp(rng, flash, 0.004, 0.4 + 0.6 * s, 1), _lamp(rng, low, 0.01, 0.6 * s, 1))
         slope = 0.8 * s / up
-        return Rig(0.55 - 0.4 * s, lamps, (slope * c, slope * d))
-    return Rig(0.44, (_lamp(rng, front, 0.06, 0.60, 3),))
+        return Rig(0.62 - 0.45 * s, lamps, (slope * c, slope * d))
+    return Rig(0.64, (_lamp(rng, front, 0.08, 0.40, 3),))
 
 
-def ambient(world: World, surface: Surface, rng: np.random.Generator, count: int = 12) -> Singles:
+def ambient(world: World, surface: Surface, rng: np.random.Generator, count: int = 10) -> Singles:
     """Return the share of the sky's light that reaches each vertex (V,) of the world in view.
 
     Rays are cosine-distributed, turned differently at each vertex, and the result is averaged
@@ -100,8 +102,8 @@ def ambient(world: World, surface: Surface, rng: np.random.Generator, count: int
         out = np.sqrt((k + 0.5) / count)  # Malley: even on the disc is cosine on the sphere
         direction = _around(normal, turn + k * 2.399963, out)
         free = ~world.caster.blocked(rays(origin, direction), _REACH)
-        total += np.clip(direction[:, 2], 0, 1) * free
-        weight += float(np.sqrt(1 - out**2))
+        total += np.clip(direction[:, 2], 0, 1) ** _PANEL * free
+        weight += float(np.sqrt(1 - out**2)) ** _PANEL
     share = np.full(len(used), 0.5, np.float32)
     share[rows] = total / weight
     return _smoothed(share, corners)
@@ -135,8 +137,8 @@ def lit(world: World, surface: Surface, paint: Paint, rig: Rig, sky: Singles) ->
     Phong; light that the pale neighbours of a mushroom throw back.
     """
     soft = is_mushroom(surface.material)
-    bounce = np.where(soft, 0.20, 0.03) * (1 - sky)
-    light = (rig.sky * (sky + bounce))[:, None] * np.ones(3)
+    bounce = np.where(soft, 0.28, 0.03) * (1 - sky)
+    light = rig.sky * (sky[:, None] + bounce[:, None] * [1.0, 0.93, 0.78])
     shine = np.zeros(len(surface.depth))
     for lamp in rig.lamps:
         for spot in lamp.spots:
@@ -144,18 +146,18 @@ def lit(world: World, surface: Surface, paint: Paint, rig: Rig, sky: Singles) ->
             light += (diffuse * lamp.power / len(lamp.spots))[:, None] * lamp.color
             shine += gleam * lamp.power / len(lamp.spots)
     change = np.clip(1 + surface.point[:, :2] @ np.asarray(rig.slope), 0.12, 2.2)
-    return ((paint.albedo * light + shine[:, None]) * change[:, None]).astype(np.float32)
+    return np.asarray((paint.albedo * light + shine[:, None]) * change[:, None], np.float32)
 
 
 def _spot(
-    world: World, surface: Surface, paint: Paint, lamp: Lamp, spot: Floats, soft: Floats
+    world: World, surface: Surface, paint: Paint, lamp: Lamp, spot: Floats, soft: NDArray[np.bool_]
 ) -> tuple[Floats, Floats]:
     """Return diffuse and mirrored light (P,) of one spot of a lamp of power 1."""
     way = spot - surface.point
     far = np.linalg.norm(way, axis=1)
     way /= far[:, None]
     facing = np.einsum("pk,pk->p", paint.normal, way)
-    wrap = np.where(soft, 0.18, 0.0)
+    wrap = np.where(soft, 0.10, 0.0)
     diffuse = np.clip((facing + wrap) / (1 + wrap), 0, 1)
     rows = np.flatnonzero(diffuse > 0)
     start = surface.point[rows] + _LIFT * surface.normal[rows]

@@ -101,8 +101,8 @@ class Painter:
         normal[flat] = np.stack([-slope[:, 0], -slope[:, 1], np.ones(len(flat))], axis=-1)
         rough = np.flatnonzero(is_mushroom(surface.material))
         for axis in range(3):
-            bump = 0.030 * self._at(surface, rows=rough, grain=0.006, axis=axis + 1)
-            bump += 0.018 * self._at(surface, rows=rough, grain=0.0012, axis=axis + 4)
+            bump = 0.016 * self._at(surface, rows=rough, grain=0.006, axis=axis + 1)
+            bump += 0.010 * self._at(surface, rows=rough, grain=0.0012, axis=axis + 4)
             normal[rough, axis] += bump
         return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
 
@@ -118,12 +118,12 @@ class Painter:
     def _cap(self, surface: Surface, rows: Ints) -> Singles:
         owner = surface.owner[rows]
         q = surface.texture[rows]
-        tone = 1 + 0.022 * self._at(surface, rows, 0.010) + 0.016 * self._at(surface, rows, 0.0016)
-        tone += 0.022 * self._fibres(surface, rows)
+        tone = 1 + 0.018 * self._at(surface, rows, 0.012) + 0.010 * self._at(surface, rows, 0.002)
+        tone += 0.012 * self._fibres(surface, rows)
         color = (self._tint[owner] * tone[:, None]).astype(np.float32)
         bare = ~self._plain[owner]
         scales = self._scales(surface, rows) * self._scaly[owner]
-        color = mix(color, (0.16, 0.085, 0.042), scales.astype(np.float32) * 0.75)
+        color = mix(color, (0.185, 0.112, 0.066), scales.astype(np.float32) * 0.75)
         pale = smoothstep(0.05, -0.25, (q[:, 2] / self._radius[owner]).astype(np.float32))
         color = mix(color, (0.76, 0.70, 0.60), 0.5 * pale * (self._scaly[owner] > 0.3))
         stain = smoothstep(1.5, 2.6, self._at(surface, rows, 0.014, 7)) * bare
@@ -143,16 +143,16 @@ class Painter:
         """Return brown scales 0..1: patches in rings, closer together towards the top."""
         q, radius = surface.texture[rows], self._radius[surface.owner[rows]]
         share = np.hypot(q[:, 0], q[:, 1]) / radius
-        patches = self._at(surface, rows, 0.0036, 2) + 0.7 * self._fibres(surface, rows)
+        patches = self._at(surface, rows, 0.0027, 2) + 0.7 * self._fibres(surface, rows)
         edge = (2.1 * share - 0.9).astype(np.float32)
         return smoothstep(-0.3, 0.6, patches - edge)
 
     def _crumbs(self, surface: Surface, rows: Ints) -> Singles:
         """Return crumbs of soil 0..1: few on most caps, many where a clump fell."""
         dirt = self._dirt[surface.owner[rows]]
-        fine = self._at(surface, rows, 0.0013, 5) + 0.9 * self._at(surface, rows, 0.011, 6)
+        fine = self._at(surface, rows, 0.0011, 5) + 0.9 * self._at(surface, rows, 0.011, 6)
         top = smoothstep(-0.4, 0.5, surface.normal[rows, 2].astype(np.float32))
-        return smoothstep(0.0, 0.25, (fine - 3.5 + 1.6 * dirt).astype(np.float32)) * top
+        return smoothstep(0.0, 0.25, (fine - 3.6 + 1.5 * dirt).astype(np.float32)) * top
 
     def _gills(self, surface: Surface, rows: Ints) -> Singles:
         q = surface.texture[rows]

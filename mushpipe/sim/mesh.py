@@ -9,7 +9,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.sim.noise import Floats
+from mushpipe.sim.noise import Floats, Reals
 
 Ints = NDArray[np.int64]
 
@@ -91,10 +91,10 @@ def revolve(rho: Floats, z: Floats, segments: int) -> Floats:
     return np.stack([x, y, np.broadcast_to(z[:, None], x.shape)], axis=-1)
 
 
-def height_field(x: Floats, y: Floats, height: Floats, material: Material) -> Mesh:
+def height_field(x: Reals, y: Reals, height: Reals, material: Material) -> Mesh:
     """Return the surface z = height (H, W) over columns x (W,) and rows y (H,), y descending."""
     grid = np.stack([*np.meshgrid(x, y), height], axis=-1)
-    flat = grid.reshape(-1, 3)
+    flat = grid.reshape(-1, 3).astype(np.float64)
     return Mesh(flat, _quads(len(y), len(x), wrap=False), flat, material)
 
 
@@ -106,9 +106,9 @@ def box(size: Sequence[float], material: Material) -> Mesh:
         for side in (-0.5, 0.5):
             face = np.insert(corner, axis, side, axis=1)
             faces.append(face if (side > 0) == (axis != 1) else face[::-1])
-    vertices = (np.concatenate(faces) + [0, 0, 0.5]) * np.asarray(size)
+    vertices = (np.concatenate(faces) + np.array([0, 0, 0.5])) * np.asarray(size)
     first = np.arange(6)[:, None] * 4
-    triangles = np.concatenate([first + [0, 1, 2], first + [0, 2, 3]])
+    triangles = np.concatenate([first + np.array([0, 1, 2]), first + np.array([0, 2, 3])])
     return Mesh(vertices, triangles, vertices, material)
 
 

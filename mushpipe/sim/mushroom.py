@@ -113,15 +113,13 @@ def _stem(mushroom: Mushroom, segments: int) -> list[Mesh]:
     top, foot = mushroom.center, mushroom.foot - [0, 0, 0.004]
     span = float(np.linalg.norm(top - foot))
     t = np.linspace(1, 0, 9)[:, None]
-    lower, upper = foot + [0, 0, 0.4 * span], top - 0.45 * span * mushroom.axis
+    lower, upper = foot + np.array([0, 0, 0.4 * span]), top - 0.45 * span * mushroom.axis
     curve = t**3 * top + 3 * t**2 * (1 - t) * upper
     curve = curve + 3 * t * (1 - t) ** 2 * lower + (1 - t) ** 3 * foot
     return [_tube(mushroom, curve, mushroom.axis, segments, 1.25)]
 
 
-def _tube(
-    mushroom: Mushroom, curve: Floats, up: Floats, segments: int, bulge: float
-) -> Mesh:
+def _tube(mushroom: Mushroom, curve: Floats, up: Floats, segments: int, bulge: float) -> Mesh:
     turn = np.arange(segments) * (2 * np.pi / segments)
     frame = turned_to(up, 0.0)
     ring = np.cos(turn)[:, None] * frame[:, 0] + np.sin(turn)[:, None] * frame[:, 1]
@@ -138,9 +136,7 @@ def _tube(
     return sheet(rings, Material.STEM, texture)
 
 
-def _disc(
-    mushroom: Mushroom, center: Floats, normal: Floats, radius: float, segments: int
-) -> Mesh:
+def _disc(mushroom: Mushroom, center: Floats, normal: Floats, radius: float, segments: int) -> Mesh:
     turn = np.arange(segments) * (2 * np.pi / segments)
     circle = np.stack([np.cos(turn), np.sin(turn), np.zeros(segments)], axis=-1)
     sizes = np.array([0.0, 0.35, 0.75, 1.0])[:, None, None] * radius

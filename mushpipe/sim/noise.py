@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +11,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
+Reals = NDArray[np.floating[Any]]
 
 _PARTS = (
     "plant", "ground", "texture", "ambient", "light", "photo", "photo frame", "fixed pattern",
@@ -56,7 +59,7 @@ class Noise3:
         cube = gaussian_filter(white, 1.5, mode="wrap")
         self._cube = cube / cube.std()
 
-    def __call__(self, points: Floats, grain: float) -> Singles:
+    def __call__(self, points: Reals, grain: float) -> Singles:
         """Return noise (N,) at points (N, 3) m; details are about `grain` m wide."""
         places = np.ascontiguousarray((np.asarray(points, np.float32) / (grain / 4.0)).T)
         return np.asarray(map_coordinates(self._cube, places, order=1, mode="grid-wrap"))

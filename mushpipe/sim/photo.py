@@ -19,7 +19,9 @@ class ColorCamera(BaseModel):
     blur: float = Field(0.65, ge=0, le=5, description="blur of the lens, sigma in px")
     vignette: float = Field(0.25, ge=0, le=1, description="loss of light in the corners, share")
     white_balance: float = Field(0.03, ge=0, le=0.5, description="spread of the colour gains")
-    noise: float = Field(1.0, ge=0, le=10, description="noise; 1: about 1.5 gray levels at mid-gray")
+    noise: float = Field(
+        1.0, ge=0, le=10, description="noise; 1: about 1.5 gray levels at mid-gray"
+    )
     jpeg_quality: int = Field(
         90, ge=0, le=100, description="quality of the camera's own JPEG; 0: none"
     )
@@ -55,9 +57,9 @@ def _contrast(image: Singles) -> Singles:
 
 
 def _shoulder(image: Singles) -> Singles:
-    """Bend what is brighter than 0.6 towards 1, as cameras do before they clip."""
-    over = np.maximum(image - 0.6, 0)
-    return np.asarray(np.minimum(image, 0.6) + 0.4 * (1 - np.exp(-over / 0.4)))
+    """Bend what is brighter than 0.7 towards 1, as cameras do before they clip."""
+    over = np.maximum(image - 0.7, 0)
+    return np.asarray(np.minimum(image, 0.7) + 0.3 * (1 - np.exp(-over / 0.3)))
 
 
 def _srgb(linear: Singles) -> Singles:
@@ -68,4 +70,5 @@ def _srgb(linear: Singles) -> Singles:
 
 def _jpeg(codes: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
     _, packed = cv2.imencode(".jpg", codes[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return np.ascontiguousarray(cv2.imdecode(packed, cv2.IMREAD_COLOR)[..., ::-1], np.uint8)
+    image = np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.uint8)
+    return np.ascontiguousarray(image[..., ::-1])

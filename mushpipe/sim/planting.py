@@ -15,10 +15,10 @@ from mushpipe.sim.shapes import CapShape, Warp, draw_shape
 _TINTS = {
     "white": (0.83, 0.80, 0.735),
     "cream": (0.74, 0.63, 0.44),
-    "brown": (0.37, 0.225, 0.125),
+    "brown": (0.36, 0.245, 0.155),
 }
 _PRINTED = (0.80, 0.795, 0.765)
-_FLATNESS = 0.65  # a cap is about this much lower than wide; scales heights when caps collide
+_FLATNESS = 0.6  # a cap is about this much lower than wide; scales heights when caps collide
 
 
 @dataclass(frozen=True)
@@ -90,8 +90,8 @@ def _seat(settings: SceneSettings, area: Area, share: float, rng: np.random.Gene
     radius = np.array([_radius(k, settings, rng) for k in kind]).reshape(-1)
     place = _places(kind, radius, settings.cluster, area, rng)
     stem = radius * rng.uniform(0.55, 1.1, len(kind)) + rng.uniform(0.002, 0.008, len(kind))
-    above = rng.exponential(0.009, len(kind)) * (radius > 0.009)
-    height = stem + (0 if lab else np.minimum(above, 0.025))
+    above = rng.exponential(0.013, len(kind)) * (radius > 0.009)
+    height = stem + (0 if lab else np.minimum(above, 0.035))
     for row, k in enumerate(kind):
         if k == Kind.STUMP:
             height[row] = rng.uniform(0.004, 0.014)
@@ -170,7 +170,7 @@ def _grow(
     if name == "mixed":
         name = ("white", "cream", "brown")[rng.integers(3)]
     tint = np.array(_PRINTED if kind == Kind.PRINTED else _TINTS[name])
-    tint = tint * rng.uniform(0.9, 1.03) * rng.normal(1, 0.012, 3)
+    tint = tint * rng.uniform(0.9, 1.03) * rng.normal(1, 0.006, 3)
     scaly = rng.uniform(0.4, 1.0) if name == "brown" else rng.choice([0.0, 0.15], p=[0.8, 0.2])
     printed = kind == Kind.PRINTED
     return Mushroom(
@@ -189,18 +189,14 @@ def _grow(
     )
 
 
-def _shape(
-    settings: SceneSettings, kind: Kind, age: float, rng: np.random.Generator
-) -> CapShape:
+def _shape(settings: SceneSettings, kind: Kind, age: float, rng: np.random.Generator) -> CapShape:
     shape = draw_shape(rng, settings.shape_family, age)
     if kind == Kind.PRINTED:  # one CAD model, a little different in print
         return CapShape(shape.family, shape.height, shape.form, shape.lip, shape.curl, True, Warp())
     return shape
 
 
-def _axis(
-    settings: SceneSettings, kind: Kind, lean: Floats, rng: np.random.Generator
-) -> Floats:
+def _axis(settings: SceneSettings, kind: Kind, lean: Floats, rng: np.random.Generator) -> Floats:
     low, high = np.radians(settings.tilt_deg)
     tilt = rng.uniform(low, high)
     if kind == Kind.FALLEN:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mushpipe.core.errors import DependencyError
 from mushpipe.sim.mesh import Ints
-from mushpipe.sim.noise import Floats, Singles
+from mushpipe.sim.noise import Floats, Reals, Singles
 
 
 def _open3d() -> Any:
@@ -77,7 +77,7 @@ class Raycaster:
         )
 
 
-def rays(origins: Floats, directions: Floats) -> Singles:
+def rays(origins: Reals, directions: Reals) -> Singles:
     """Return rays (N, 6) float32 from origins (N, 3) or (3,) and directions (N, 3)."""
     out = np.empty((len(directions), 6), np.float32)
     out[:, :3], out[:, 3:] = origins, directions

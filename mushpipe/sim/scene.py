@@ -17,9 +17,9 @@ from mushpipe.sim.photo import ColorCamera
 from mushpipe.sim.render import Surface, look
 from mushpipe.sim.sensor import DepthSensor, Exact
 from mushpipe.sim.settings import SceneSettings
-from mushpipe.sim.world import View, World, make_world, view_at
+from mushpipe.sim.world import View, make_world, view_at
 
-_SUBPIXELS = np.array([[-0.375, -0.125], [0.125, -0.375], [0.375, 0.125], [-0.125, 0.375]])
+_SUBPIXELS = np.array([[-0.34, -0.05], [0.13, -0.32], [0.21, 0.37]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,9 @@ class Scene:
 
     def color(self, still: Still, frame: int) -> NDArray[np.uint8]:
         """Return the colour image (H, W, 3) of a frame."""
-        return self._color.develop(still.image, generator(self._settings.seed, "photo frame", frame))
+        return self._color.develop(
+            still.image, generator(self._settings.seed, "photo frame", frame)
+        )
 
     def depth(self, still: Still, frame: int) -> NDArray[np.uint16]:
         """Return the depth image (H, W) of a frame, in the sensor's unit."""

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from mushpipe.sim.material import Paint
-from mushpipe.sim.noise import Singles, blurred, generator
+from mushpipe.sim.noise import Floats, Singles, blurred, generator
 from mushpipe.sim.raycast import rays
 from mushpipe.sim.render import Surface
 from mushpipe.sim.world import View, World
@@ -115,12 +115,12 @@ class DepthSensor(BaseModel):
         return total
 
 
-def _shadow(world: World, surface: Surface, projector: Singles) -> Bools:
+def _shadow(world: World, surface: Surface, projector: Floats) -> Bools:
     start = surface.point + 0.0004 * surface.normal
     return world.caster.blocked(rays(start, projector - start), 1.0)
 
 
-def _mirrors(surface: Surface, paint: Paint, projector: Singles) -> Bools:
+def _mirrors(surface: Surface, paint: Paint, projector: Floats) -> Bools:
     way = projector - surface.point
     half = way / np.linalg.norm(way, axis=1, keepdims=True) + surface.sight
     half /= np.linalg.norm(half, axis=1, keepdims=True)

@@ -61,7 +61,9 @@ class SceneSettings(BaseModel):
         for name, low, high in (("size_mm", 5.0, 150.0), ("tilt_deg", 0.0, 45.0)):
             first, last = getattr(self, name)
             if not low <= first <= last <= high:
-                raise ValueError(f"{name} is {first}, {last}: expected {low} <= first <= last <= {high}")
+                raise ValueError(
+                    f"{name} is {first}, {last}: expected {low} <= first <= last <= {high}"
+                )
         return self
 
     def camera(self) -> Camera:

@@ -83,7 +83,7 @@ def view_at(settings: SceneSettings, along: float) -> View:
     lean = np.array([[1, 0, 0], [0, c, s], [0, -s, c]])
     rotation = lean @ np.diag([1.0, -1.0, -1.0])
     back = -settings.distance * rotation[:, 2]
-    return View(settings.camera(), rotation, back + [along, 0.0, 0.0])
+    return View(settings.camera(), rotation, back + np.array([along, 0.0, 0.0]))
 
 
 def area_in_view(settings: SceneSettings, travel: float) -> tuple[Area, float]:
@@ -113,13 +113,11 @@ def make_world(settings: SceneSettings, travel: float = 0.0) -> World:
         base = tables.target(wide, texel)
     mushrooms = _mushrooms(settings, view, share, base)
     things = _things(settings, view, base, mushrooms, rng)
-    step = 2.5 if settings.scene == "bed" else 6.0
+    step = 3.4 if settings.scene == "bed" else 6.0
     return _union(base, mushrooms, [base.mesh(step * settings.pixel()), *things], settings.pixel())
 
 
-def _mushrooms(
-    settings: SceneSettings, view: Area, share: float, base: Ground
-) -> list[Mushroom]:
+def _mushrooms(settings: SceneSettings, view: Area, share: float, base: Ground) -> list[Mushroom]:
     if settings.scene == "plane":
         return []
     left = view.x0 + (0.16 * (view.x1 - view.x0) / share if settings.tray else 0.0)

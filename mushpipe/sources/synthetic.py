@@ -31,9 +31,7 @@ class SyntheticSource(SceneSettings, ReplaySource):
     travel_mm: float = Field(
         100, ge=0, le=1000, description="way after which a moving gantry turns back, mm"
     )
-    missing_depth: int | None = Field(
-        None, ge=2, description="every so many-th frame has no depth"
-    )
+    missing_depth: int | None = Field(None, ge=2, description="every so many-th frame has no depth")
     gap_after: int | None = Field(None, ge=1, description="frames before a gap in time")
     gap_s: float = Field(2, ge=0, description="length of the gap, s")
     color: ColorCamera = Field(ColorCamera(), description="the colour camera")
