@@ -50,8 +50,8 @@ unit: $(STAMP)-dev
 test-slow: $(STAMP)-dev system-libraries
 	$(BIN)/pytest -m slow
 
-recordings: $(STAMP)
-	$(BIN)/mushpipe record --source synthetic --frames 4 --out recordings/first-bed.mcap
+recordings: $(STAMP) system-libraries
+	$(BIN)/python -m mushpipe.sim.recordings
 
 clean:
 	rm -rf $(VENV) out failures .mypy_cache .ruff_cache .pytest_cache

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from mushpipe.sim.mesh import Material, Mesh, box, height_field, revolve, sheet
+from mushpipe.sim.mushroom import turned_to
 from mushpipe.sim.noise import Floats, Reals, Singles, blurred, mix, smoothstep
 from mushpipe.sim.planting import Area
 
@@ -40,9 +41,11 @@ class Ground:
 
     def sample(self, layer: Singles, points: Reals) -> Singles:
         """Interpolate a layer (H, W[, C]) at points (N, 2) m; the border goes on outside."""
+        if not len(points):
+            return np.zeros((0, *layer.shape[2:]), np.float32)
         column, row = self.texels(points)
         # remap holds at most 32767 rows: fold the list of points into a table
-        width = max(1, min(4096, len(column)))
+        width = min(4096, len(column))
         rest = -len(column) % width
         x, y = (np.pad(axis, (0, rest)).reshape(-1, width) for axis in (column, row))
         found = cv2.remap(layer, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -138,14 +141,28 @@ def _mycelium(
     return np.asarray(np.clip(np.maximum(cover, threads), 0, 0.95), np.float32)
 
 
-def lump(rng: np.random.Generator, radius: float, rings: int, material: Material) -> Mesh:
-    """Return a knobbly ball around the origin."""
+def _lumps(rng: np.random.Generator, rings: int, material: Material) -> list[Mesh]:
+    """Return some different knobbly balls of radius about 1 around the origin."""
     t = np.linspace(0, np.pi, rings)
     ball = revolve(np.sin(t), np.cos(t), 2 * rings)
     ball[[0, -1], :, :2] = 0
-    turns, phase = rng.normal(0, 2.2, (3, 3)), rng.uniform(0, 2 * np.pi, 3)
-    knobs = 1 + 0.16 * np.cos(ball @ turns + phase).sum(axis=-1, keepdims=True)
-    return sheet(ball * knobs * rng.uniform(0.7, 1.15, 3) * radius, material)
+    kinds = []
+    for _ in range(12):
+        turns, phase = rng.normal(0, 2.2, (3, 3)), rng.uniform(0, 2 * np.pi, 3)
+        knobs = 1 + 0.16 * np.cos(ball @ turns + phase).sum(axis=-1, keepdims=True)
+        kinds.append(sheet(ball * knobs * rng.uniform(0.7, 1.15, 3), material))
+    return kinds
+
+
+def _scatter(
+    kinds: list[Mesh], spots: Floats, radius: Floats, rng: np.random.Generator
+) -> list[Mesh]:
+    """Put one of the kinds, of a radius (N,) m and turned somehow, at each spot (N, 3) m."""
+    which, turn = rng.integers(len(kinds), size=len(spots)), rng.uniform(0, 7, len(spots))
+    return [
+        kinds[k].placed(turned_to(np.array([0.0, 0.0, 1.0]), float(t)) * r, spot)
+        for k, t, r, spot in zip(which, turn, radius, spots, strict=True)
+    ]
 
 
 def litter(ground: Ground, area: Area, density: float, rng: np.random.Generator) -> list[Mesh]:
@@ -157,24 +174,20 @@ def litter(ground: Ground, area: Area, density: float, rng: np.random.Generator)
         density: Pieces per m^2.
         rng: Draws them.
     """
-    count = round(density * area.size)
-    spots = area.draw(rng, count)
-    heights = ground.height_at(spots)
     pieces = []
-    for spot, height in zip(spots, heights, strict=True):
-        radius = 0.0015 + 0.0065 * rng.beta(1, 4.5)
-        stone = rng.random() < 0.06
-        rings = 6 if radius < 0.003 else 9
-        piece = lump(rng, radius, rings, Material.STONE if stone else Material.CLOD)
-        position = np.array([*spot, height + radius * rng.uniform(-0.2, 0.5)])
-        pieces.append(piece.placed(np.eye(3), position))
+    for share, rings, material in ((0.94, 7, Material.CLOD), (0.06, 9, Material.STONE)):
+        flat = area.draw(rng, round(share * density * area.size))
+        radius = 0.0015 + 0.0065 * rng.beta(1, 4.5, len(flat))
+        z = ground.height_at(flat) + radius * rng.uniform(-0.2, 0.5, len(flat))
+        spots = np.column_stack([flat, z])
+        pieces += _scatter(_lumps(rng, rings, material), spots, radius, rng)
     return pieces
 
 
 def primordia(
     ground: Ground, around: Floats, amount: float, area: Area, rng: np.random.Generator
 ) -> list[Mesh]:
-    """Return clumps of white beads of 1 to 4 mm: mushrooms that have only begun.
+    """Return clumps of white beads of 1 to 5 mm: mushrooms that have only begun.
 
     Args:
         ground: They sit on it.
@@ -183,19 +196,20 @@ def primordia(
         area: Where they may be.
         rng: Draws them.
     """
-    beads = []
-    for _ in range(round(600 * amount * area.size)):
-        spot = area.draw(rng, 1)[0]
-        if len(around) and rng.random() < 0.5:
-            spot = around[rng.integers(len(around))] + rng.normal(0, 0.014, 2)
-        number = 1 + int(rng.exponential(8))
-        spread = 0.0012 * np.sqrt(number)
-        places = spot + rng.normal(0, spread, (number, 2)) * rng.uniform(0.5, 1.6, 2)
-        for place, z in zip(places, ground.height_at(places), strict=True):
-            radius = float(np.clip(rng.gamma(2.0, 0.0006), 0.0004, 0.003))
-            bead = lump(rng, radius, 5 if radius < 0.0012 else 7, Material.MYCELIUM)
-            beads.append(bead.placed(np.eye(3), np.array([*place, z + 0.6 * radius])))
-    return beads
+    clumps = area.draw(rng, round(430 * amount * area.size))
+    near = np.flatnonzero(rng.random(len(clumps)) < (0.5 if len(around) else 0))
+    if len(near):
+        hosts = around[rng.integers(len(around), size=len(near))]
+        clumps[near] = hosts + rng.normal(0, 0.016, (len(near), 2))
+    number = 1 + rng.exponential(11, len(clumps)).astype(int)
+    spread = 0.00125 * np.sqrt(number)[:, None] * rng.uniform(0.5, 1.6, (len(clumps), 2))
+    flat = np.repeat(clumps, number, axis=0)
+    flat = flat + rng.normal(0, 1, flat.shape) * np.repeat(spread, number, axis=0)
+    radius = np.clip(rng.gamma(2.0, 0.00062, len(flat)), 0.0004, 0.003)
+    spots = np.column_stack(
+        [flat, ground.height_at(flat) + radius * rng.uniform(0.3, 1.6, len(flat))]
+    )
+    return _scatter(_lumps(rng, 5, Material.MYCELIUM), spots, radius, rng)
 
 
 def tray_rim(x: float, area: Area) -> list[Mesh]:

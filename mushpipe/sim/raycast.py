@@ -55,6 +55,8 @@ class Raycaster:
             Distance (N,), inf where nothing; triangle (N,), -1 where none; and barycentric weights
             (N, 3) of its corners.
         """
+        if not len(rays):  # Embree as open3d calls it crashes on none
+            return np.empty(0), np.empty(0, np.int64), np.empty((0, 3))
         hit = self._scene.cast_rays(self._tensor(rays), nthreads=1)
         distance = hit["t_hit"].numpy().astype(np.float64)
         uv = hit["primitive_uvs"].numpy().astype(np.float64)
@@ -64,11 +66,15 @@ class Raycaster:
 
     def blocked(self, rays: Singles, far: float) -> NDArray[np.bool_]:
         """Return (N,) whether anything stands on a ray before the distance `far`."""
+        if not len(rays):
+            return np.empty(0, np.bool_)
         found = self._scene.test_occlusions(self._tensor(rays), 0.0, far, nthreads=1)
         return np.asarray(found.numpy(), np.bool_)
 
     def every(self, rays: Singles) -> tuple[Ints, Floats, Ints]:
         """Return all crossings (M,) of rays (N, 6): ray, distance and triangle."""
+        if not len(rays):
+            return np.empty(0, np.int64), np.empty(0), np.empty(0, np.int64)
         hit = self._scene.list_intersections(self._tensor(rays), nthreads=1)
         return (
             hit["ray_ids"].numpy().astype(np.int64),

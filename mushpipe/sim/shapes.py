@@ -67,7 +67,7 @@ def draw_shape(rng: np.random.Generator, family: Family, age: float) -> CapShape
         height = np.clip(0.95 - 0.35 * age + rng.normal(0, 0.05), 0.5, 1.05)
         lip, curl = rng.uniform(0.05, 0.4), 0.4 - 0.25 * age
     else:  # flat-topped
-        form = (rng.uniform(0.72, 0.92), rng.uniform(0.6, 0.85))
+        form = (rng.uniform(0.80, 0.95), rng.uniform(0.78, 0.95))
         height = np.clip(0.72 - 0.35 * age + rng.normal(0, 0.05), 0.3, 0.8)
         lip, curl = rng.uniform(0.02, 0.3), 0.35 - 0.2 * age
     return CapShape(family, float(height), form, lip, curl, age < 0.45, draw_warp(rng, age))

@@ -47,7 +47,7 @@ def _wood(
     rings = np.sin(2 * np.pi * (y + 0.012 * bend) / 0.011 + 1.2 * bend)
     fine = _stretched(rng, shape, 0.02 / texel, 0.0006 / texel)
     pores = _stretched(rng, shape, 0.006 / texel, 0.0005 / texel) > 1.7
-    tone = 1 + 0.16 * rings + 0.10 * fine + 0.08 * blurred(rng, shape, 0.05 / texel)
+    tone = 1 + 0.10 * rings + 0.10 * fine + 0.08 * blurred(rng, shape, 0.05 / texel)
     base = np.array([0.30, 0.165, 0.075], np.float32) * rng.uniform(0.5, 1.2)
     albedo = base * np.clip(tone, 0.3, 2)[..., None] ** [1.0, 1.15, 1.35]
     albedo = albedo * np.where(pores, 0.55, 1.0)[..., None]
@@ -60,7 +60,7 @@ def _cloth(
     """A plain weave with soft folds."""
     y, x = (np.arange(n, dtype=np.float32) * texel for n in shape)
     weave = np.sin(2 * np.pi * x / 0.0017)[None] * np.sin(2 * np.pi * y / 0.0017)[:, None]
-    folds = 0.0015 * blurred(rng, shape, 0.03 / texel)
+    folds = 0.0003 * blurred(rng, shape, 0.03 / texel)
     paint = np.array(_PAINTS[rng.integers(len(_PAINTS))], np.float32)
     tone = 1 + 0.18 * weave + 0.08 * blurred(rng, shape, 1.0)
     return (paint * tone[..., None]).astype(np.float32), folds + 0.00012 * weave
@@ -96,7 +96,7 @@ def clutter(count: int, area: Area, keep: Floats, rng: np.random.Generator) -> l
         make = _paper if near or number % 3 == 0 else (_carton, _cup)[rng.integers(2)]
         thing = make(rng, number)
         turn = turned_to(np.array([0.0, 0.0, 1.0]), float(rng.uniform(0, 2 * np.pi)))
-        things.append(thing.placed(turn, np.array([*spot, 0.0002])))
+        things.append(thing.placed(turn, np.array([*spot, 0.0012])))
     return things
 
 

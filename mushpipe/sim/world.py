@@ -114,7 +114,9 @@ def make_world(settings: SceneSettings, travel: float = 0.0) -> World:
     mushrooms = _mushrooms(settings, view, share, base)
     things = _things(settings, view, base, mushrooms, rng)
     step = 3.4 if settings.scene == "bed" else 6.0
-    return _union(base, mushrooms, [base.mesh(step * settings.pixel()), *things], settings.pixel())
+    return assemble(
+        base, mushrooms, [base.mesh(step * settings.pixel()), *things], settings.pixel()
+    )
 
 
 def _mushrooms(settings: SceneSettings, view: Area, share: float, base: Ground) -> list[Mushroom]:
@@ -146,8 +148,18 @@ def _things(
     return things
 
 
-def _union(base: Ground, mushrooms: list[Mushroom], things: list[Mesh], pixel: float) -> World:
-    """Join all meshes into one, remembering what each triangle is."""
+def assemble(base: Ground, mushrooms: list[Mushroom], things: list[Mesh], pixel: float) -> World:
+    """Join all meshes into one, remembering what each triangle is.
+
+    Args:
+        base: The ground; its mesh is one of `things`.
+        mushrooms: Their order gives them their numbers.
+        things: Meshes that belong to no mushroom.
+        pixel: Size of a pixel on the bed, m; sets how fine mushrooms are meshed.
+
+    Raises:
+        DependencyError: open3d or a library of the system is missing.
+    """
     entries = [(mesh, -1, False) for mesh in things]
     bodies, size = [], sum(len(mesh.vertices) for mesh in things)
     for number, mushroom in enumerate(mushrooms):

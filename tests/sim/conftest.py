@@ -1,0 +1,49 @@
+"""Small hand-made scenes whose truth is known in closed form."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from mushpipe.sim.mesh import Material
+from mushpipe.sim.mushroom import Kind, Mushroom
+from mushpipe.sim.planting import Area
+from mushpipe.sim.settings import SceneSettings
+from mushpipe.sim.shapes import CapShape, Warp
+from mushpipe.sim.table import target
+from mushpipe.sim.world import World, assemble
+
+BALL = CapShape("a", 1.0, (2.0,), 1.0, 0.999, True, Warp())
+
+
+@pytest.fixture(autouse=True)
+def _open3d() -> None:
+    pytest.importorskip("open3d", reason="open3d needs libGL and libEGL", exc_type=ImportError)
+
+
+def ball(center, radius, axis=(0.0, 0.0, 1.0), kind=Kind.GROWING, shape=BALL) -> Mushroom:
+    """A mushroom whose cap is a whole sphere."""
+    center, axis = np.array(center, float), np.array(axis, float)
+    foot = center * [1, 1, 0]
+    axis /= np.linalg.norm(axis)
+    return Mushroom(kind, center, axis, 0.3, radius, shape, foot, radius / 3, (0.8, 0.8, 0.8))
+
+
+@pytest.fixture
+def settings() -> SceneSettings:
+    """A plane at 50 cm under a 320x240 camera."""
+    return SceneSettings(scene="plane", distance=0.5, width=320, height=240)
+
+
+@pytest.fixture
+def build(settings: SceneSettings) -> Callable[..., World]:
+    """Return a function that puts mushrooms on the plane; `pixel` small makes fine meshes."""
+
+    def make(*mushrooms: Mushroom, pixel: float = 0.0004) -> World:
+        ground = target(Area(-0.4, 0.4, -0.3, 0.3), 0.01)
+        assert ground.material == Material.TARGET
+        return assemble(ground, list(mushrooms), [ground.mesh(0.05)], pixel)
+
+    return make
