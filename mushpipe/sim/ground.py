@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from mushpipe.sim.mesh import Material, Mesh, box, height_field, revolve, sheet
-from mushpipe.sim.mushroom import turned_to
+from mushpipe.sim.mushroom import about_z
 from mushpipe.sim.noise import Floats, Reals, Singles, blurred, mix, smoothstep
 from mushpipe.sim.planting import Area
 
@@ -160,7 +160,7 @@ def _scatter(
     """Put one of the kinds, of a radius (N,) m and turned somehow, at each spot (N, 3) m."""
     which, turn = rng.integers(len(kinds), size=len(spots)), rng.uniform(0, 7, len(spots))
     return [
-        kinds[k].placed(turned_to(np.array([0.0, 0.0, 1.0]), float(t)) * r, spot)
+        kinds[k].placed(about_z(t) * r, spot)
         for k, t, r, spot in zip(which, turn, radius, spots, strict=True)
     ]
 

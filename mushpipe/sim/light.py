@@ -79,7 +79,7 @@ def rig_for(settings: SceneSettings, rng: np.random.Generator) -> Rig:
         lamps = (_lamp(rng, flash, 0.004, 0.4 + 0.6 * s, 1), _lamp(rng, low, 0.01, 0.6 * s, 1))
         slope = 0.8 * s / up
         return Rig(0.62 - 0.45 * s, lamps, (slope * c, slope * d))
-    return Rig(0.64, (_lamp(rng, front, 0.08, 0.40, 3),))
+    return Rig(0.64, (_lamp(rng, front, 0.08, 0.40, 2),))
 
 
 def ambient(world: World, surface: Surface, rng: np.random.Generator, count: int = 10) -> Singles:

@@ -65,8 +65,13 @@ def turned_to(axis: Floats, spin: float) -> Floats:
     x = np.cross(helper, axis)
     x /= np.linalg.norm(x)
     basis = np.stack([x, np.cross(axis, x), axis], axis=1)
-    c, s = np.cos(spin), np.sin(spin)
-    return np.asarray(basis @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]))
+    return np.asarray(basis @ about_z(spin))
+
+
+def about_z(turn: float) -> Floats:
+    """Return the rotation (3, 3) about z by an angle, rad."""
+    c, s = np.cos(turn), np.sin(turn)
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
 
 def build(mushroom: Mushroom, pixel: float) -> tuple[list[Mesh], list[Mesh]]:
@@ -76,10 +81,10 @@ def build(mushroom: Mushroom, pixel: float) -> tuple[list[Mesh], list[Mesh]]:
         mushroom: What to build.
         pixel: Size of a pixel on the bed, m; sets how fine the mesh is.
     """
-    fine = float(np.clip(mushroom.radius / pixel / 20, 0.4, 2.5))
+    fine = float(np.clip(mushroom.radius / pixel / 20, 0.2, 2.5))
     if mushroom.kind == Kind.STUMP:
         return _stump(mushroom, fine), []
-    rings, segments = round(11 + 5 * fine), 4 * round(8 + 3 * fine)
+    rings, segments = round(6 + 10 * fine), 4 * round(4 + 7 * fine)
     return _cap(mushroom, rings, segments), _stem(mushroom, segments // 2)
 
 

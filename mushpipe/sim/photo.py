@@ -15,7 +15,7 @@ class ColorCamera(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    exposure: float = Field(0.0, ge=-4, le=4, description="exposure, stops")
+    exposure: float = Field(0.05, ge=-4, le=4, description="exposure, stops")
     blur: float = Field(0.65, ge=0, le=5, description="blur of the lens, sigma in px")
     vignette: float = Field(0.25, ge=0, le=1, description="loss of light in the corners, share")
     white_balance: float = Field(0.03, ge=0, le=0.5, description="spread of the colour gains")

@@ -7,7 +7,7 @@ import numpy as np
 
 from mushpipe.sim.ground import Ground, grid_shape
 from mushpipe.sim.mesh import Material, Mesh, box, revolve, sheet
-from mushpipe.sim.mushroom import turned_to
+from mushpipe.sim.mushroom import about_z
 from mushpipe.sim.noise import Floats, Singles, blurred
 from mushpipe.sim.planting import Area
 
@@ -95,8 +95,8 @@ def clutter(count: int, area: Area, keep: Floats, rng: np.random.Generator) -> l
         near = len(keep) and float(np.hypot(*(keep - spot).T).min()) < 0.075
         make = _paper if near or number % 3 == 0 else (_carton, _cup)[rng.integers(2)]
         thing = make(rng, number)
-        turn = turned_to(np.array([0.0, 0.0, 1.0]), float(rng.uniform(0, 2 * np.pi)))
-        things.append(thing.placed(turn, np.array([*spot, 0.0012])))
+        turn = rng.uniform(0, 2 * np.pi)
+        things.append(thing.placed(about_z(turn), np.array([*spot, 0.0012])))
     return things
 
 
