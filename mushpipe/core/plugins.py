@@ -20,7 +20,7 @@ from typing import Any, cast
 
 import pluggy
 
-from mushpipe.core.errors import PluginError, suggest
+from mushpipe.core.errors import DependencyError, PluginError, suggest
 from mushpipe.core.stage import Kind, Plugin, kind_of
 
 GROUP = "mushpipe"
@@ -49,10 +49,13 @@ class Entry:
 
         Raises:
             PluginError: It cannot be imported, or is of another kind.
+            DependencyError: It needs a library that this system lacks.
         """
         where = f"{self.kind} '{self.name}' of {self.distribution} {self.version}"
         try:
             plugin = _import(self.target) if isinstance(self.target, str) else self.target
+        except DependencyError:
+            raise
         except Exception as error:
             raise PluginError(f"{where} cannot be imported: {_brief(error)}") from error
         if kind_of(plugin) != self.kind:

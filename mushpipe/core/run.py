@@ -75,7 +75,7 @@ class _Runner:
             raise TypeError("the plan's source is not a Source")
         info = RunInfo(source.name(), build_manifest(self.plan))
         with ExitStack() as stack:
-            stack.enter_context(_opened(self.plan.source, lambda: None))
+            stack.enter_context(_opened(self.plan.source, _opener(self.plan.source)))
             for node in self.plan.stages:
                 stack.enter_context(_opened(node, _opener(node)))
             for node in self.plan.sinks:
@@ -194,7 +194,7 @@ def _opener(node: Node, info: RunInfo | None = None) -> Callable[[], None]:
     plugin = node.plugin
     if isinstance(plugin, Sink) and info is not None:
         return lambda: plugin.open(info)
-    return plugin.open if isinstance(plugin, Stage) else lambda: None
+    return plugin.open if isinstance(plugin, Stage | Source) else lambda: None
 
 
 @contextmanager

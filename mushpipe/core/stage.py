@@ -84,6 +84,9 @@ class Source(Plugin):
         """Return the recordings it reads, for the manifest."""
         return ()
 
+    def open(self) -> None:
+        """Check that there is something to read, before any sink creates a file."""
+
     def frames(self) -> Iterator[RgbdFrame]:
         """Yield frames; raise InputError after the last good one where the input is damaged."""
         raise NotImplementedError

@@ -75,6 +75,15 @@ class McapSource(ReplaySource):
         """Return the recording."""
         return (self.path,)
 
+    def open(self) -> None:
+        """Check that the file is there and is MCAP.
+
+        Raises:
+            UsageError: There is no such file.
+            InputError: It is empty or not MCAP.
+        """
+        RecordingReader(self.path)
+
     def counts(self) -> dict[str, int]:
         """Return how many images found no partner or could not be decoded."""
         return {name: count for name, count in sorted(self._counts.items()) if count}
@@ -144,7 +153,8 @@ class _Player:
         self.topics = topics
         self.counts = counts
         self.numbered = MANIFEST in index.metadata or GRAPH in index.metadata
-        self.start_ns = index.start_ns + round(settings.start * 1e9)
+        # Without a start nothing is skipped, so that nothing can be lost unnoticed.
+        self.start_ns = index.start_ns + round(settings.start * 1e9) if settings.start else 0
         end = settings.end
         self.end_ns = None if end is None else index.start_ns + round(end * 1e9)
         self.error = ""

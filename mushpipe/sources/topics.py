@@ -16,6 +16,7 @@ IMAGES = {
     "foxglove.CompressedImage",
 }
 CALIBRATIONS = {"sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration"}
+_NOT_CAMERA = (RESULT_PREFIX, "/truth/")
 _TRANSPORTS = ("/compressedDepth", "/compressed")
 
 
@@ -54,7 +55,7 @@ def choose_topics(
 
 def _topics(index: Index, schemas: set[str]) -> list[str]:
     named = sorted(t for t in index.channels if index.schema_name(t) in schemas)
-    return [t for t in named if index.counts[t] and not t.startswith(RESULT_PREFIX)]
+    return [t for t in named if index.counts[t] and not t.startswith(_NOT_CAMERA)]
 
 
 def _colors(images: list[str]) -> list[str]:
