@@ -26,7 +26,10 @@ from mushpipe.core.geometry import Camera
 from mushpipe.core.types import Header, RgbdFrame
 
 # What mcap's reader raises on bytes that are not what they claim to be.
-_GARBAGE = (McapError, ValueError, struct.error, ZstdError, RuntimeError, MemoryError, TypeError)
+_GARBAGE = (
+    *(McapError, ValueError, struct.error, ZstdError, RuntimeError, MemoryError, TypeError),
+    *(OverflowError, LookupError),
+)
 # opcode, length, start of the summary, start of its offsets, CRC of all from that start to here
 _FOOTER = struct.Struct("<BQQQI")
 MANIFEST = "mushpipe.manifest"

@@ -16,9 +16,9 @@ EXAMPLE = ROOT / "examples/mushpipe-brightest"
 def run(use: str, tmp_path: Path, **environment: str) -> subprocess.CompletedProcess[str]:
     settings = {"segment.use": use, "segment.share": 0.15, "log.path": tmp_path / "log.mcap"}
     overrides = [text for key, value in settings.items() for text in ("--set", f"{key}={value}")]
+    code = "from mushpipe.cli import main; main()"
     return subprocess.run(
-        [sys.executable, "-c", "from mushpipe.cli import main; main()"]
-        + ["run", str(ROOT / "graphs/pick.yaml"), "--frames", "1", *overrides],
+        [sys.executable, "-c", code, "run", "graphs/pick.yaml", "--frames", "1", *overrides],
         cwd=ROOT,
         env={**os.environ, **environment},
         capture_output=True,
