@@ -14,7 +14,7 @@ from mushpipe.core.errors import GraphError, Problem
 Location = tuple[str | int, ...]
 MAX_NODES = 20_000
 MAX_DEPTH = 50
-# What PyYAML raises on text that is no YAML: an escape like "\\UFFFFFFFF" is an OverflowError.
+# What PyYAML raises on text that is no YAML: an escape like "\UFFFFFFFF" is an OverflowError.
 _UNREADABLE = (yaml.YAMLError, RecursionError, ValueError, OverflowError)
 _COLLECTIONS = {"map", "seq"}
 _SCALARS = {"null", "bool", "int", "float", "str", "timestamp"}

@@ -46,13 +46,11 @@ def run(
         The report; a failure is in its ``error``, never raised.
     """
     runner = _Runner(plan.fresh(), stop or threading.Event(), progress, capsules)
-    started = time.monotonic()
     try:
         runner.run()
     except MushpipeError as error:
         runner.report.error = error
-    runner.report.elapsed_s = time.monotonic() - started
-    runner.report.interrupted = runner.interrupted
+    runner.report.elapsed_s = time.monotonic() - runner.started
     return runner.report
 
 
@@ -67,13 +65,15 @@ class _Runner:
         self.report = RunReport(durations={node.name: Durations() for node in plan.stages})
         on_error = plan.on_error or ("fail" if plan.replay() else "skip")
         self.tolerance = plan.max_failures if on_error == "skip" else 1
-        self.interrupted = False
+        self.started = time.monotonic()
+        self.saved: set[str] = set()  # nodes with a failure capsule
 
     def run(self) -> None:
         source = self.plan.source.plugin
         if not isinstance(source, Source):
             raise TypeError("the plan's source is not a Source")
-        info = RunInfo(source.name(), build_manifest(self.plan))
+        with _named(self.plan.source):
+            info = RunInfo(source.name(), build_manifest(self.plan))
         with ExitStack() as stack:
             stack.enter_context(_opened(self.plan.source, _opener(self.plan.source)))
             for node in self.plan.stages:
@@ -101,7 +101,7 @@ class _Runner:
         failures_in_a_row = 0
         while not reader.box.finished and not any(thread.error for thread in threads):
             if self.stop.is_set():
-                self.interrupted = True
+                self.report.interrupted = True
                 return
             frame = reader.box.get(timeout=0.1)
             if frame is None:
@@ -138,6 +138,7 @@ class _Runner:
         self.report.read = reader.box.accepted
         self.report.dropped = reader.box.dropped
         self.report.waiting = reader.box.waiting
+        self.report.elapsed_s = time.monotonic() - self.started
         self.report.source = source.counts()
         self.report.error = reader.error
         for thread in threads:
@@ -179,12 +180,12 @@ class _Runner:
         return values
 
     def _save_capsule(self, node: Node, frame: RgbdFrame, error: Exception) -> None:
-        done = any(f"failure-{node.name}-" in path for path in self.report.capsules)
-        if self.capsules is None or done:
+        if self.capsules is None or node.name in self.saved:
             return
+        self.saved.add(node.name)
         try:
             path = write_capsule(self.capsules, self.plan, node, frame, str(error))
-        except OSError as trouble:
+        except Exception as trouble:  # the failure of the stage is the one to report
             logger.warning("the failing frame could not be saved: %s", trouble)
         else:
             self.report.capsules.append(str(path))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from mushpipe.core.errors import PluginError
+from mushpipe.core.errors import MushpipeError
 from mushpipe.core.graph import GraphFile
 from mushpipe.core.plugins import Registry
 from mushpipe.core.stage import Kind
@@ -28,7 +28,7 @@ def _one_of(registry: Registry, kind: Kind, definitions: dict[str, Any]) -> dict
     for name in registry.names(kind):
         try:
             plugin = registry.entries[kind, name][0].load()
-        except PluginError:
+        except MushpipeError:
             continue
         names.append(name)
         own = plugin.model_json_schema(ref_template=f"#/$defs/{kind}.{name}.{{model}}")
