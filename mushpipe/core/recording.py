@@ -65,7 +65,7 @@ class Index:
 
 
 class RecordingReader:
-    """Reads an MCAP file from front to back, chunk by chunk, checking every CRC.
+    """Reads an MCAP file from front to back, chunk by chunk, checking the CRC of each.
 
     Messages come in file order, sorted by log time within a chunk. ``damage`` says afterwards,
     in words, what could not be read.

@@ -16,7 +16,7 @@ import numpy as np
 
 from mushpipe.core.capsule import write_capsule
 from mushpipe.core.edges import SinkThread, SourceThread, failure
-from mushpipe.core.errors import MushpipeError, StageError
+from mushpipe.core.errors import MushpipeError, StageError, UsageError
 from mushpipe.core.manifest import build_manifest
 from mushpipe.core.plan import Link, Node, Plan
 from mushpipe.core.report import Durations, RunReport
@@ -74,6 +74,7 @@ class _Runner:
             raise TypeError("the plan's source is not a Source")
         with _named(self.plan.source):
             info = RunInfo(source.name(), build_manifest(self.plan))
+            self._spare_the_recording(source, info)
         with ExitStack() as stack:
             stack.enter_context(_opened(self.plan.source, _opener(self.plan.source)))
             for node in self.plan.stages:
@@ -84,13 +85,33 @@ class _Runner:
             reader = SourceThread(self.plan.source, source, threading.Event())
             try:
                 self._loop(reader, threads)
+            except StageError as error:
+                self.report.error = error
             finally:
                 self._wind_up(reader, source, threads)
-            for thread in threads:
-                plugin = thread.node.plugin
-                if isinstance(plugin, Sink) and thread.error is None:
-                    with _named(thread.node):
-                        plugin.finish(self.report.summary())
+            self._finish(threads)
+
+    def _spare_the_recording(self, source: Source, info: RunInfo) -> None:
+        """Raise UsageError where a sink would write over the recording that is played."""
+        played = {path.resolve() for path in source.files()}
+        for node in self.plan.sinks:
+            files = node.plugin.files(info) if isinstance(node.plugin, Sink) else ()
+            for path in files:
+                if path.resolve() in played:
+                    raise UsageError(f"sink '{node.name}' would write over its own source {path}")
+
+    def _finish(self, threads: list[SinkThread]) -> None:
+        """Tell the sinks how the run went; the first error of the run stays the one reported."""
+        for thread in threads:
+            plugin = thread.node.plugin
+            if not isinstance(plugin, Sink) or thread.error is not None:
+                continue
+            try:
+                plugin.finish(self.report.summary())
+            except Exception as error:
+                failed = failure(thread.node, None, error)
+                self.report.error = self.report.error or failed
+                logger.warning("%s", failed)
 
     def _sink_thread(self, node: Node) -> SinkThread:
         return SinkThread(node, self.plan.delivery(node) == "latest", self.tolerance)
@@ -140,13 +161,13 @@ class _Runner:
         self.report.waiting = reader.box.waiting
         self.report.elapsed_s = time.monotonic() - self.started
         self.report.source = source.counts()
-        self.report.error = reader.error
         for thread in threads:
             self.report.sinks[thread.node.name] = thread.report()
             if thread.error is not None:
-                self.report.error = thread.error
+                self.report.error = self.report.error or thread.error
                 if thread.failed_frame is not None:
                     self._save_capsule(thread.node, thread.failed_frame, thread.error)
+        self.report.error = self.report.error or reader.error
 
     def _process(self, frame: RgbdFrame) -> Trace:
         seen = replace(frame, attached={})
@@ -176,7 +197,8 @@ class _Runner:
             )
         result = node.plugin.process(**arguments)  # type: ignore[attr-defined]
         values = result if isinstance(result, tuple) else (result,)
-        _check_outputs(node, values, frame)
+        seen = [value for value in arguments.values() if isinstance(value, RgbdFrame)]
+        _check_outputs(node, values, seen[0] if seen else frame)
         return values
 
     def _save_capsule(self, node: Node, frame: RgbdFrame, error: Exception) -> None:
@@ -236,6 +258,7 @@ def _sink_inputs(node: Node, trace: Trace) -> dict[str, Any]:
 
 
 def _check_outputs(node: Node, values: tuple[Any, ...], frame: RgbdFrame) -> None:
+    """Raise TypeError or ValueError where outputs are not as declared, or do not fit the frame."""
     expected = node.ports.outputs
     matches = len(values) == len(expected) and all(map(isinstance, values, expected))
     if not matches:

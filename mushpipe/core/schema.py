@@ -19,7 +19,11 @@ def graph_schema(registry: Registry) -> dict[str, Any]:
     for key, kind in (("stages", "stage"), ("sinks", "sink")):
         choice = _one_of(registry, kind, definitions)  # type: ignore[arg-type]
         properties[key]["additionalProperties"] = choice
-    return {**schema, "$schema": "http://json-schema.org/draft-07/schema#", "$defs": definitions}
+    return {
+        **schema,
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "$defs": definitions,
+    }
 
 
 def _one_of(registry: Registry, kind: Kind, definitions: dict[str, Any]) -> dict[str, Any]:

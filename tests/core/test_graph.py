@@ -7,7 +7,10 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mushpipe.core.document import parse_document
 from mushpipe.core.errors import GraphError
+from mushpipe.core.graph import compile_document
+from mushpipe.core.plugins import load_registry
 from tests.core.lab import Lab, cli
 
 KEYS = st.sampled_from(
@@ -269,3 +272,18 @@ def test_paths_are_relative_to_the_graph_file_unless_the_shell_gives_them(lab: L
     assert str(given) == "bed.mcap"
     absolute = lab.compile(graph, "source.path=/data/bed.mcap").source.plugin.path
     assert str(absolute) == "/data/bed.mcap"
+
+
+def test_a_fault_at_the_top_does_not_hide_the_faults_below() -> None:
+    text = (
+        "mushpipe: 1\nsede: 3\nsource: {use: synthetic, cuont: 3}\n"
+        "stages:\n  a: {use: otsu, x: 1}\n"
+    )
+    with pytest.raises(GraphError) as caught:
+        compile_document(parse_document(text, "g.yaml", Path()), load_registry())
+    assert [p.line for p in caught.value.problems] == [2, 3, 5]
+
+
+def test_numbers_may_be_written_as_powers_of_ten() -> None:
+    data = parse_document("a: 1e-3\nb: -2E+4\nc: 1.5e3\nd: 1e\n", "g.yaml", Path()).data
+    assert data == {"a": 1e-3, "b": -2e4, "c": 1.5e3, "d": "1e"}
