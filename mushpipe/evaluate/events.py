@@ -14,7 +14,7 @@ from mushpipe.core.tables import Columns, Floats, column
 from mushpipe.core.types import Header
 from mushpipe.evaluate.matching import Matching, match
 from mushpipe.evaluate.results import Detections
-from mushpipe.evaluate.truth import FrameTruth
+from mushpipe.evaluate.truth import FrameTruth, Place
 
 UP = (0.0, 0.0, -1.0)
 
@@ -29,10 +29,14 @@ class Kind(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """A judged frame: what is there, what was found, and which is which."""
+    """A judged frame: what is there, what was found, and which is which.
+
+    ``header`` is None where the results hold no answer for the frame.
+    """
 
     recording: str
-    header: Header
+    place: Place
+    header: Header | None
     truth: FrameTruth
     detections: Detections
     matching: Matching
@@ -47,14 +51,15 @@ class Verdict:
 
 def judge(
     recording: str,
-    header: Header,
+    place: Place,
     truth: FrameTruth,
+    header: Header | None,
     detections: Detections,
     threshold: float = 0.5,
 ) -> Verdict:
     """Judge a frame; see `matching` for the rules."""
     matching = match(truth, detections.center, detections.radius, threshold)
-    return Verdict(recording, header, truth, detections, matching)
+    return Verdict(recording, place, header, truth, detections, matching)
 
 
 @dataclass(frozen=True, eq=False)

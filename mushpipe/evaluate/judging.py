@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
 from mushpipe.core.errors import InputError
-from mushpipe.core.types import Header
 from mushpipe.evaluate.events import UP, Events, Verdict, comparable, events_of, judge
 from mushpipe.evaluate.metrics import Value, measure
 from mushpipe.evaluate.results import Results, none_found
-from mushpipe.evaluate.truth import TruthSet, has_truth, read_truth
+from mushpipe.evaluate.truth import Place, TruthSet, has_truth, read_truth
 
 
 @dataclass(frozen=True)
@@ -41,6 +38,7 @@ class Judged:
     name: str
     results: Results
     truth: TruthSet
+    recording: Path | None = None
     verdicts: list[Verdict] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -107,47 +105,52 @@ def summarise(name: str, verdicts: Sequence[Verdict], rules: Rules) -> Summary:
     )
 
 
-def judge_results(results: Results, truth: TruthSet, rules: Rules, name: str = "") -> Judged:
+def judge_results(
+    results: Results, truth: TruthSet, rules: Rules, recording: Path | None = None
+) -> Judged:
     """Judge every frame whose truth is known.
 
     A frame with truth that the results do not answer counts as one in which nothing was found,
     unless the run was asked for a part of the recording and the frame is outside of it.
+
+    Args:
+        results: What was found.
+        truth: What is there.
+        rules: How to judge.
+        recording: What the results were made from, where it is at hand.
     """
-    judged = Judged(name or results.path.stem, results, truth)
-    unknown = 0
+    judged = Judged((recording or results.path).stem, results, truth, recording)
     for header, detections in results.frames:
-        known = truth.of(header)
-        if known is None:
-            unknown += 1
-            continue
-        judged.verdicts.append(judge(judged.name, header, known, detections, rules.iou))
-    if unknown:
+        place = truth.place(header)
+        if place is not None:
+            known = truth.frames[place]
+            judged.verdicts.append(judge(judged.name, place, known, header, detections, rules.iou))
+    if len(judged.verdicts) < len(results.frames):
+        unknown = len(results.frames) - len(judged.verdicts)
         judged.notes.append(f"{unknown} frames have no truth and are not judged")
     if not all(map(comparable, judged.verdicts)):
         judged.notes.append("truth and results are in different frames: 3D errors are unknown")
-    unanswered = list(_unanswered(results, truth)) if judged.verdicts else []
+    unanswered = _unanswered(judged)
     if unanswered:
         judged.notes.append(f"{len(unanswered)} frames have no answer: all in them is missed")
-    for header in unanswered:
-        known = truth.of(header)
-        if known is not None:
-            judged.verdicts.append(judge(judged.name, header, known, none_found(), rules.iou))
-    judged.verdicts.sort(key=lambda v: (v.header.stamp_ns or np.inf, v.header.sequence))
+    for place in unanswered:
+        known = truth.frames[place]
+        judged.verdicts.append(judge(judged.name, place, known, None, none_found(), rules.iou))
+    judged.verdicts.sort(key=lambda verdict: verdict.place)
     return judged
 
 
-def _unanswered(results: Results, truth: TruthSet) -> Iterator[Header]:
-    """Yield headers of the frames with truth that were not answered and should have been."""
-    stamps = {header.stamp_ns for header, _ in results.frames}
-    numbers = {header.sequence for header, _ in results.frames}
-    for stamp in truth.by_stamp:
-        inside = min(stamps) <= stamp <= max(stamps)
-        if stamp not in stamps and (inside or not results.partial):
-            yield Header(stamp, -1, "")
-    for number in truth.by_index:
-        inside = min(numbers) <= number <= max(numbers)
-        if number not in numbers and (inside or not results.partial):
-            yield Header(0, number, "")
+def _unanswered(judged: Judged) -> list[Place]:
+    """Return the frames with truth that were not answered and should have been."""
+    answered = {verdict.place for verdict in judged.verdicts}
+    if not answered:
+        return []  # these results and this truth have nothing to do with each other
+    first, last = min(answered), max(answered)
+    return [
+        place
+        for place in judged.truth.frames
+        if place not in answered and (first <= place <= last or not judged.results.partial)
+    ]
 
 
 def find_truth(results: Results) -> TruthSet:

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.errors import InputError
+from mushpipe.core.errors import EXIT_DIFFERS, EXIT_OK, InputError, UsageError
 from mushpipe.core.tables import Floats
 from mushpipe.evaluate import statistics
 from mushpipe.evaluate.metrics import Value
+from mushpipe.evaluate.thresholds import Outcome, check, parse_threshold, require_known
 
 WINDOW = 31
 PLANE_METRICS = ("mean_mm", "std_mm", "range_mm", "offset_mm", "flat_std_mm", "valid")
@@ -96,3 +97,47 @@ def measure_plane(
         few = len(frames) < 2 or not resamples
         values[name] = Value(float(value), *((np.nan, np.nan) if few else ends), len(x))
     return PlaneRow(recording.stem, distance_m, len(frames), values)
+
+
+def judge_planes(
+    recordings: list[Path], distances: str, thresholds: list[str], resamples: int, seed: int
+) -> tuple[list[PlaneRow], list[Outcome], int]:
+    """Measure recordings of planes.
+
+    Args:
+        recordings: One per distance.
+        distances: True distances in metres, separated by commas; a single one serves all.
+        thresholds: On `PLANE_METRICS`; every recording must keep them.
+        resamples: Number of bootstrap samples.
+        seed: Seed of the bootstrap.
+
+    Returns:
+        A row per recording, the thresholds' outcomes, and the exit code.
+
+    Raises:
+        UsageError: The distances or thresholds are wrong.
+        InputError: A recording cannot be played, or holds no depth.
+    """
+    bounds = [parse_threshold(text) for text in thresholds]
+    require_known(bounds, PLANE_METRICS)
+    truths = _distances(distances, len(recordings))
+    rows = [
+        measure_plane(path, truth, WINDOW, resamples, seed)
+        for path, truth in zip(recordings, truths, strict=True)
+    ]
+    outcomes = [
+        outcome
+        for row in rows
+        for outcome in check(bounds, {name: value.value for name, value in row.values.items()})
+    ]
+    return rows, outcomes, EXIT_OK if all(o.kept for o in outcomes) else EXIT_DIFFERS
+
+
+def _distances(text: str, recordings: int) -> list[float]:
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        raise UsageError(f"--plane {text}: expected metres, separated by commas") from None
+    if len(values) not in (1, recordings) or not all(0 < value < 100 for value in values):
+        raise UsageError(f"--plane {text}: expected one distance in metres, or {recordings}")
+    return values * recordings if len(values) == 1 else values

@@ -17,7 +17,6 @@ from mushpipe.core.report import RunReport
 from mushpipe.core.stage import RunInfo, Sink, Source
 
 SINK = "evaluation"
-_COMMA = re.compile(r""",(?![^\[\]{}]*[\]}])(?=(?:[^"]*"[^"]*")*[^"]*$)""")
 
 
 @dataclass(frozen=True)
@@ -31,7 +30,7 @@ class Alternative:
 def alternatives(matrix: Iterable[str]) -> list[Alternative]:
     """Return every combination of ``a.b=x,y`` texts; the first is what others are compared with.
 
-    Commas within brackets or double quotes belong to a value: ``detect.radius_px=[8,38],[8,45]``.
+    Commas within brackets belong to a value: ``detect.radius_px=[8,38],[8,45]``.
 
     Raises:
         UsageError: A text has no values, or the same twice.
@@ -39,11 +38,23 @@ def alternatives(matrix: Iterable[str]) -> list[Alternative]:
     axes = []
     for text in matrix:
         path, equals, values = text.partition("=")
-        options = [value.strip() for value in _COMMA.split(values)]
+        options = [value.strip() for value in _split(values)]
         if not equals or not all(options) or len(set(options)) < len(options):
             raise UsageError(f"--matrix {text}: expected a.b=value,other with different values")
         axes.append([f"{path.strip()}={value}" for value in options])
     return [Alternative(" ".join(chosen), chosen) for chosen in itertools.product(*axes)]
+
+
+def _split(values: str) -> list[str]:
+    """Split at the commas that stand outside of brackets."""
+    parts, depth = [""], 0
+    for letter in values:
+        depth += (letter in "[{") - (letter in "]}")
+        if letter == "," and depth == 0:
+            parts.append("")
+        else:
+            parts[-1] += letter
+    return parts
 
 
 def recordings_in(paths: Sequence[Path]) -> list[Path]:
@@ -103,8 +114,12 @@ def plans(
     overrides: Sequence[str],
     options: Sequence[Alternative],
     out: Path,
-) -> list[tuple[Alternative, Path | None, Plan]]:
-    """Compile every run before the first begins, so that a fault in the last shows at once."""
+) -> list[tuple[Alternative, int, Plan]]:
+    """Compile every run before the first begins, so that a fault in the last shows at once.
+
+    Returns:
+        Per run its alternative, the number of its recording, and what to run.
+    """
     registry = load_registry()
     sources: Sequence[Path | None] = recordings or [None]
     result = []
@@ -115,7 +130,7 @@ def plans(
                 name = f"{name}-{number}"
             file = out / ".".join(filter(None, [name, slug(option), "mcap"]))
             plan = plan_for(graph, recording, [*overrides, *option.overrides], file, registry)
-            result.append((option, recording, plan))
+            result.append((option, number, plan))
     return result
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import orjson
@@ -34,26 +35,28 @@ class FrameTruth:
     frame_id: str | None = None
 
 
+Place = tuple[Literal["stamp_ns", "index"], int]
+"""How a frame is found: by `Header.stamp_ns`, or by its number, `Header.sequence`."""
+
+
 @dataclass(frozen=True, eq=False)
 class TruthSet:
-    """The truth of all frames of a recording, by their stamps or by their numbers.
+    """The truth of the frames of a recording.
 
     Attributes:
         name: Where it comes from.
-        by_stamp: Truth by `Header.stamp_ns`.
-        by_index: Truth by `Header.sequence`.
+        frames: The truth of each frame.
         damage: What could not be read, in words.
     """
 
     name: str
-    by_stamp: Mapping[int, FrameTruth]
-    by_index: Mapping[int, FrameTruth]
+    frames: Mapping[Place, FrameTruth]
     damage: tuple[str, ...] = ()
 
-    def of(self, header: Header) -> FrameTruth | None:
-        """Return the truth of a frame; None where it is not known."""
-        found = self.by_stamp.get(header.stamp_ns)
-        return found if found is not None else self.by_index.get(header.sequence)
+    def place(self, header: Header) -> Place | None:
+        """Return where the truth of a frame stands; None where it is not known."""
+        places: tuple[Place, Place] = ("stamp_ns", header.stamp_ns), ("index", header.sequence)
+        return next((place for place in places if place in self.frames), None)
 
 
 def read_truth(path: Path) -> TruthSet:
@@ -77,7 +80,7 @@ def truth_of_recording(path: Path) -> TruthSet:
         InputError: It has none, or a message on it cannot be read.
     """
     reader = RecordingReader(path)
-    frames: dict[int, FrameTruth] = {}
+    frames: dict[Place, FrameTruth] = {}
     for raw in reader.messages({TRUTH_TOPIC}):
         name = raw.schema.name if raw.schema else ""
         try:
@@ -87,10 +90,10 @@ def truth_of_recording(path: Path) -> TruthSet:
         if decoded is None or not isinstance(decoded.table, Truth):
             raise InputError(f"{path}: {TRUTH_TOPIC} holds '{name}', expected mushpipe.Truth")
         header = decoded.header
-        frames[header.stamp_ns] = FrameTruth(decoded.table, frame_id=header.frame_id)
+        frames["stamp_ns", header.stamp_ns] = FrameTruth(decoded.table, frame_id=header.frame_id)
     if not frames:
         raise InputError(f"{path}: it carries no truth (no messages on {TRUTH_TOPIC})")
-    return TruthSet(path.name, frames, {}, tuple(reader.damage))
+    return TruthSet(path.name, frames, tuple(reader.damage))
 
 
 def truth_of_labels(path: Path) -> TruthSet:
@@ -111,26 +114,20 @@ def truth_of_labels(path: Path) -> TruthSet:
         raise InputError("\n  ".join([f"{path}: not valid labels:", *faults[:20]])) from error
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: no labels: {error}") from error
-    stamped = {f.stamp_ns: f for f in labels.frames if f.stamp_ns is not None}
-    numbered = {f.index: f for f in labels.frames if f.index is not None}
-    if len(stamped) + len(numbered) < len(labels.frames):
+    frames = {_place(frame): _frame_truth(path, frame, labels.frame_id) for frame in labels.frames}
+    if len(frames) < len(labels.frames):
         raise InputError(f"{path}: a frame is labelled twice")
-
-    def frame_truth(frame: Frame) -> FrameTruth:
-        circles = [[c.u, c.v, c.radius_px] for c in frame.may_find]
-        may_find = np.array(circles, dtype=float).reshape(-1, 3)
-        return FrameTruth(_caps(path, frame), may_find, labels.frame_id)
-
-    return TruthSet(
-        path.name,
-        {stamp: frame_truth(frame) for stamp, frame in stamped.items()},
-        {index: frame_truth(frame) for index, frame in numbered.items()},
-    )
+    return TruthSet(path.name, frames)
 
 
-def _caps(path: Path, frame: Frame) -> Truth:
+def _place(frame: Frame) -> Place:
+    return ("index", frame.index or 0) if frame.stamp_ns is None else ("stamp_ns", frame.stamp_ns)
+
+
+def _frame_truth(path: Path, frame: Frame, frame_id: str | None) -> FrameTruth:
+    circles = [[c.u, c.v, c.radius_px] for c in frame.may_find]
+    may_find = np.array(circles, dtype=float).reshape(-1, 3)
     try:
-        return truth_of(frame.caps)
+        return FrameTruth(truth_of(frame.caps), may_find, frame_id)
     except ValueError as error:
-        place = frame.index if frame.stamp_ns is None else frame.stamp_ns
-        raise InputError(f"{path}: frame {place}: {error}") from error
+        raise InputError(f"{path}: frame {'='.join(map(str, _place(frame)))}: {error}") from error
