@@ -42,7 +42,8 @@ def quantities_of(events: Events) -> dict[str, Floats]:
         **_calibration(events),
     }
     for name in _COVERED:
-        known = np.isfinite(getattr(events, name)).reshape(len(events), -1).all(axis=1)
+        finite = np.isfinite(getattr(events, name))
+        known = finite.all(axis=tuple(range(1, finite.ndim)))
         result[f"has_{name}"] = np.where(found, known, np.nan)
     return result
 

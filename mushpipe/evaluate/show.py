@@ -86,7 +86,7 @@ def judgement_tables(judgement: Judgement) -> Iterator[Table | Text]:
             yield from speed_table(section)
     if judgement.outcomes:
         yield threshold_table(judgement.outcomes)
-    for text in (*_notes(judgement), *judgement.damage):
+    for text in notes_of(judgement):
         yield Text(f"note: {text}", style="yellow")
 
 
@@ -97,19 +97,21 @@ def _single(section: Section) -> Iterator[Table | Text]:
     elif rows:
         rows = [(section.evaluation.recordings[0].name, section.overall)]
     yield headline_table("recording", rows)
-    yield error_table(section.overall)
+    if section.overall.found:
+        yield error_table(section.overall)
     yield stated_table(section.overall)
     yield from speed_table(section)
 
 
-def _notes(judgement: Judgement) -> list[str]:
+def notes_of(judgement: Judgement) -> list[str]:
+    """Return what was noticed on the way, and what could not be read."""
     notes = [
         f"{judged.name}: {text}"
         for section in judgement.sections
         for judged in section.evaluation.recordings
         for text in judged.notes
     ]
-    return list(dict.fromkeys(notes))
+    return list(dict.fromkeys([*notes, *judgement.damage]))
 
 
 def table(title: str, first: str, columns: Iterable[str]) -> Table:
