@@ -83,16 +83,13 @@ def _svg(figure: Figure, prefix: str) -> str:
     return re.sub(r"font: ([\d.]+px) [^;\"]*", r"font-size: \1", text).replace(INK, "currentColor")
 
 
-def _axes(columns: int = 1, rows: int = 1, size: tuple[float, float] = (5.2, 3.1)) -> list[Axes]:
+def _axes(
+    columns: int = 1, rows: int = 1, size: tuple[float, float] = (5.2, 3.1)
+) -> tuple[Figure, list[Axes]]:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=size, layout="constrained")
-    return list(np.ravel(figure.subplots(rows, columns)))
-
-
-def _figure(axes: Axes) -> Figure:
-    figure: Any = axes.get_figure(root=True)
-    return figure
+    return figure, list(np.ravel(figure.subplots(rows, columns)))
 
 
 def wilson(successes: NDArray[Any], trials: NDArray[Any]) -> tuple[Floats, Floats]:
@@ -119,7 +116,7 @@ def _by_radius(events: Events) -> tuple[Figure | None, str, str, bool]:
     if not len(radii):
         return None, title, caption, False
     edges = bins_of(radii)
-    (axes,) = _axes()
+    figure, (axes,) = _axes()
     for name, kind, radius, color, shift in (
         ("precision", Kind.MISSED, events.radius, BLUE, -0.06),
         ("recall", Kind.FALSE, events.true_radius, ORANGE, 0.06),
@@ -141,7 +138,7 @@ def _by_radius(events: Events) -> tuple[Figure | None, str, str, bool]:
     axes.set(xlabel="radius, px", ylim=(-0.03, 1.03))
     axes.grid(axis="y", color=INK, alpha=0.12, lw=0.6)
     axes.legend(loc="lower right", ncols=2)
-    return _figure(axes), title, caption, False
+    return figure, title, caption, False
 
 
 def _against_tilt(events: Events) -> tuple[Figure | None, str, str, bool]:
@@ -153,8 +150,8 @@ def _against_tilt(events: Events) -> tuple[Figure | None, str, str, bool]:
     if not known.any():
         return None, title, caption, False
     error, tilt = error[known], tilt[known]
-    (axes,) = _axes()
-    axes.plot(tilt, error, "o", ms=2.6, mew=0, alpha=0.45, color=BLUE, rasterized=False)
+    figure, (axes,) = _axes()
+    axes.plot(tilt, error, "o", ms=2.6, mew=0, alpha=0.45, color=BLUE)
     edges = bins_of(tilt)
     if len(edges) > 1:
         bins = np.clip(np.digitize(tilt, edges) - 1, 0, len(edges) - 2)
@@ -164,8 +161,8 @@ def _against_tilt(events: Events) -> tuple[Figure | None, str, str, bool]:
     axes.plot([0, end], [0, end], "--", lw=0.9, color=INK, alpha=0.5, label="upright")
     axes.set(xlabel="true tilt, degrees", ylabel="axis error, degrees", xlim=(0, None))
     axes.set_ylim(0, max(np.quantile(error, 0.99) * 1.15, 1.0))
-    axes.legend(loc="upper left", ncols=2)
-    return _figure(axes), title, caption, False
+    axes.legend(loc="upper right", ncols=2)
+    return figure, title, caption, False
 
 
 _HISTOGRAMS = {
@@ -193,7 +190,7 @@ def _histograms(events: Events) -> tuple[Figure | None, str, str, bool]:
         return None, title, caption, True
     columns = min(3, len(known))
     rows = -(-len(known) // columns)
-    panels = _axes(columns, rows, (10.4, 2.1 * rows + 0.2))
+    figure, panels = _axes(columns, rows, (10.4, 2.1 * rows + 0.2))
     for axes, (label, x) in zip(panels, known.items(), strict=False):
         low, high = np.quantile(x, [0.005, 0.995])
         low, high = (min(low, 0.0) - 1e-9, high + 1e-9) if (x >= 0).all() else (low, high)
@@ -203,7 +200,7 @@ def _histograms(events: Events) -> tuple[Figure | None, str, str, bool]:
         axes.yaxis.set_major_locator(_whole())
     for axes in panels[len(known) :]:
         axes.set_visible(False)
-    return _figure(panels[0]), title, caption, True
+    return figure, title, caption, True
 
 
 def _whole() -> Any:
@@ -221,7 +218,7 @@ def _calibration(events: Events) -> tuple[Figure | None, str, str, bool]:
     groups = _stated(events)
     if not groups:
         return None, title, caption, True
-    panels = _axes(len(groups), 1, (10.4 if len(groups) > 1 else 5.2, 2.9))
+    figure, panels = _axes(len(groups), 1, (10.4 if len(groups) > 1 else 5.2, 2.9))
     for axes, (label, (sigma, z2)) in zip(panels, groups.items(), strict=True):
         edges = bins_of(sigma)
         bins = np.clip(np.digitize(sigma, edges) - 1, 0, max(0, len(edges) - 2))
@@ -234,7 +231,7 @@ def _calibration(events: Events) -> tuple[Figure | None, str, str, bool]:
         axes.set(xlim=(0, end), ylim=(0, end), xlabel=f"stated sigma: {label}")
         axes.set_title(f"mean z² = {z2.mean():.2f}", loc="left")
     panels[0].set_ylabel("root mean square error")
-    return _figure(panels[0]), title, caption, len(groups) > 1
+    return figure, title, caption, len(groups) > 1
 
 
 def _stated(events: Events) -> dict[str, tuple[Floats, Floats]]:
