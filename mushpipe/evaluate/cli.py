@@ -176,9 +176,9 @@ def _write(text: str) -> None:
 def _print(items: Iterable[Any]) -> None:
     from rich.console import Console
 
-    console = Console(file=sys.stdout, highlight=False)
+    console = Console(file=sys.stdout, highlight=False, markup=False)
     if not console.is_terminal:
-        console = Console(file=sys.stdout, highlight=False, width=150)
+        console = Console(file=sys.stdout, highlight=False, markup=False, width=200)
     for item in items:
         console.print(item)
         console.print()

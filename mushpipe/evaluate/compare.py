@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from mushpipe.evaluate import statistics
-from mushpipe.evaluate.events import Events
+from mushpipe.evaluate.events import Events, Kind
+from mushpipe.evaluate.matching import assign, circle_iou
 from mushpipe.evaluate.metrics import METRICS, Value, quantities_of
 
 COMPARED = (
@@ -66,10 +67,21 @@ def differences(
 
 
 def _by_member(base: Events, other: Events) -> tuple[Events, Events, int]:
-    """Number the mushrooms of a single frame as units: a truth is the same one in both."""
-    shift = 1 + int(-base.member.min(initial=0))
-    # The false detections of the other alternative are mushrooms of nobody else's.
-    other = replace(other, member=np.where(other.member < 0, other.member - shift, other.member))
-    members = np.unique(np.concatenate([base.member, other.member]))
-    numbered = [replace(e, unit=np.searchsorted(members, e.member)) for e in (base, other)]
+    """Number the mushrooms of a single frame as units, the same ones alike in both.
+
+    A truth is the same one anyhow; false detections are where their circles overlap.
+    """
+    mine, theirs = (np.flatnonzero(e.kind == Kind.FALSE) for e in (base, other))
+    iou = circle_iou(
+        base.center[mine], base.radius[mine], other.center[theirs], other.radius[theirs]
+    )
+    rows, columns = assign(iou, 0.5)
+    member = other.member.copy()
+    member[theirs] = base.member.min(initial=0) - 1 - np.arange(len(theirs))
+    member[theirs[columns]] = base.member[mine[rows]]
+    members = np.unique(np.concatenate([base.member, member]))
+    numbered = [
+        replace(events, unit=np.searchsorted(members, of))
+        for events, of in ((base, base.member), (other, member))
+    ]
     return numbered[0], numbered[1], len(members)

@@ -20,8 +20,10 @@ from mushpipe.evaluate.show import (
     LABELS,
     QUANTITIES,
     STATED,
+    comparison_title,
     digits_of,
     interval,
+    known_values,
     notes_of,
     number,
 )
@@ -82,8 +84,9 @@ def _heading(judgement: Judgement) -> str:
         bootstrap += " (here of the mushrooms of the one frame)"
     return (
         f"<h1>Evaluation</h1><p>{escape(names)}</p>"
-        f'<p class="soft">{first.overall.frames} frames, {first.overall.truths} mushrooms that '
-        f"count; a match is a circle IoU of at least {rules.iou:g}; {bootstrap}.</p>"
+        f'<p class="soft">Frames: {first.overall.frames}; mushrooms that count: '
+        f"{first.overall.truths}; a match is a circle IoU of at least "
+        f"{rules.iou:g}; {bootstrap}.</p>"
     )
 
 
@@ -127,28 +130,28 @@ def _alternatives(judgement: Judgement) -> str:
 
 def _comparison(comparison: Comparison) -> str:
     rows = []
-    for name, value in comparison.values.items():
+    for name, value in known_values(comparison):
         digits = digits_of(name) + 1
         below = interval(value, digits).replace("..", " … ")
         sure = value.low > 0 or value.high < 0
         text = number(value.value, digits)
         rows.append([escape(name), f"<b>{text}</b>" if sure else text, below])
-    title = f"{comparison.label} minus {comparison.base}, on the same {comparison.frames} frames"
-    return f"<h3>{escape(title)}</h3>" + table(["metric", "difference", "95 % interval"], rows)
+    title = escape(comparison_title(comparison))
+    return f"<h3>{title}</h3>" + table(["metric", "difference", "95 % interval"], rows)
 
 
-def _headline(first: str, rows: Iterable[tuple[str, Summary]], total: bool) -> str:
+def _headline(first: str, rows: Sequence[tuple[str, Summary]], total: bool) -> str:
     counts = ("frames", "truths", "found", "missed", "false", "ignored")
+    metrics = [n for n in CARDS if any(np.isfinite(s.values[n].value) for _, s in rows)]
     lines = [
         [
             escape(name),
             *(str(getattr(summary, count)) for count in counts),
-            *(_cell(metric, summary.values[metric]) for metric in CARDS),
+            *(_cell(metric, summary.values[metric]) for metric in metrics),
         ]
         for name, summary in rows
     ]
-    heads = [first, *counts, *(f"{title}{unit}" for title, unit in CARDS.values())]
-    return table(heads, lines, total)
+    return table([first, *counts, *("".join(CARDS[n]) for n in metrics)], lines, total)
 
 
 def _section(section: Section, place: int) -> str:

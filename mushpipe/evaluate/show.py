@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 
+from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
 
@@ -73,7 +74,7 @@ def cell(name: str, value: Value) -> Text:
     return text.append(f"\n{below}", style="dim") if below else text
 
 
-def judgement_tables(judgement: Judgement) -> Iterator[Table | Text]:
+def judgement_tables(judgement: Judgement) -> Iterator[Titled | Text]:
     """Yield what to print, from top to bottom."""
     if len(judgement.sections) == 1:
         yield from _single(judgement.sections[0])
@@ -90,7 +91,7 @@ def judgement_tables(judgement: Judgement) -> Iterator[Table | Text]:
         yield Text(f"note: {text}", style="yellow")
 
 
-def _single(section: Section) -> Iterator[Table | Text]:
+def _single(section: Section) -> Iterator[Titled | Text]:
     rows = [(summary.name, summary) for summary in section.recordings]
     if len(rows) > 1:
         rows.append(("overall", section.overall))
@@ -114,22 +115,33 @@ def notes_of(judgement: Judgement) -> list[str]:
     return list(dict.fromkeys([*notes, *judgement.damage]))
 
 
-def table(title: str, first: str, columns: Iterable[str]) -> Table:
-    """Return an empty table with one left-aligned column."""
-    result = Table(first, box=None, pad_edge=False, title=title, title_justify="left")
-    result.title_style = "bold"
-    for name in columns:
-        result.add_column(name, justify="right", no_wrap=True)
-    return result
+class Titled:
+    """A table under a title that may be wider than it."""
+
+    def __init__(self, title: str, first: str, columns: Iterable[str]) -> None:
+        self.title = Text(title, style="bold")
+        self.table = Table(box=None, pad_edge=False)
+        self.table.add_column(first, no_wrap=True)
+        for name in columns:
+            self.table.add_column(name, justify="right", no_wrap=True)
+
+    def add_row(self, *cells: str | Text, style: str = "") -> None:
+        """Add a row."""
+        self.table.add_row(*cells, style=style)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Yield title and table, as rich asks for them."""
+        yield self.title
+        yield self.table
 
 
-def headline_table(first: str, rows: Sequence[tuple[str, Summary]]) -> Table:
+def headline_table(first: str, rows: Sequence[tuple[str, Summary]]) -> Titled:
     """Counts and the figures that people ask for first, one row per recording.
 
     The intervals of its errors stand in `error_table`, for all recordings together.
     """
     counts = ("frames", "truths", "found", "false", "ignored")
-    result = table("Detection", first, [*counts, *HEADLINE.values()])
+    result = Titled("Detection", first, [*counts, *HEADLINE.values()])
     for name, summary in rows:
         numbers = [str(getattr(summary, count)) for count in counts]
         cells = [cell(n, summary.values[n]) for n in RATIOS]
@@ -139,9 +151,9 @@ def headline_table(first: str, rows: Sequence[tuple[str, Summary]]) -> Table:
     return result
 
 
-def error_table(summary: Summary) -> Table:
+def error_table(summary: Summary) -> Titled:
     """Every error of the mushrooms found, with its statistics."""
-    result = table("Errors of the mushrooms found", "detected - true", ["n", *LABELS])
+    result = Titled("Errors of the mushrooms found", "detected - true", ["n", *LABELS])
     for quantity, title in QUANTITIES.items():
         metrics = {m.label: name for name, m in METRICS.items() if m.quantity == quantity}
         n = summary.values[next(iter(metrics.values()))].n
@@ -154,10 +166,10 @@ def error_table(summary: Summary) -> Table:
     return result
 
 
-def stated_table(summary: Summary) -> Table:
+def stated_table(summary: Summary) -> Titled:
     """How often a value is given at all, and whether the sigmas stated with it are true."""
     columns = ["given", "sigma given", "mean squared z"]
-    result = table("Coverage and stated sigmas (1 is calibrated)", "value", columns)
+    result = Titled("Coverage and stated sigmas (1 is calibrated)", "value", columns)
     for name in STATED:
         keys = (
             f"coverage_{CARRIED[name]}",
@@ -168,20 +180,30 @@ def stated_table(summary: Summary) -> Table:
     return result
 
 
-def speed_table(section: Section) -> Iterator[Table]:
+def speed_table(section: Section) -> Iterator[Titled]:
     """Time per stage, where the results hold it."""
     if section.speed:
-        result = table(f"Time per frame {section.label}".strip(), "stage", ["p50 ms", "p95 ms"])
+        result = Titled(f"Time per frame {section.label}".strip(), "stage", ["p50 ms", "p95 ms"])
         for stage, row in section.speed.items():
             result.add_row(stage, number(row["p50_ms"]), number(row["p95_ms"]))
         yield result
 
 
-def comparison_table(comparison: Comparison) -> Table:
+def comparison_title(comparison: Comparison) -> str:
+    """Return what is compared with what."""
+    same = "the same frame" if comparison.frames == 1 else f"the same {comparison.frames} frames"
+    return f"{comparison.label} minus {comparison.base}, on {same}"
+
+
+def known_values(comparison: Comparison) -> list[tuple[str, Value]]:
+    """Return the differences that are known, by the name of their metric."""
+    return [item for item in comparison.values.items() if math.isfinite(item[1].value)]
+
+
+def comparison_table(comparison: Comparison) -> Titled:
     """Paired differences on the same frames."""
-    title = f"{comparison.label} minus {comparison.base}, paired over {comparison.frames} frames"
-    result = table(title, "metric", ["difference", "95 % interval"])
-    for name, value in comparison.values.items():
+    result = Titled(comparison_title(comparison), "metric", ["difference", "95 % interval"])
+    for name, value in known_values(comparison):
         digits = digits_of(name) + 1
         sure = value.low > 0 or value.high < 0
         result.add_row(
@@ -190,9 +212,9 @@ def comparison_table(comparison: Comparison) -> Table:
     return result
 
 
-def threshold_table(outcomes: Sequence[tuple[str, Outcome]]) -> Table:
+def threshold_table(outcomes: Sequence[tuple[str, Outcome]]) -> Titled:
     """What was asked for and what came out."""
-    result = table("Thresholds", "threshold", ["value", ""])
+    result = Titled("Thresholds", "threshold", ["value", ""])
     for label, outcome in outcomes:
         word = Text("kept", style="green") if outcome.kept else Text("missed", style="bold red")
         name = f"{outcome.threshold.text} {label}".strip()
@@ -200,10 +222,10 @@ def threshold_table(outcomes: Sequence[tuple[str, Outcome]]) -> Table:
     return result
 
 
-def plane_table(rows: Iterable[PlaneRow]) -> Table:
+def plane_table(rows: Iterable[PlaneRow]) -> Titled:
     """The paper's Table I."""
     titles = ["mean mm", "std mm", "range mm", "offset mm", "flat std mm", "valid"]
-    result = table("Depth on a plane", "recording", ["true mm", "frames", *titles])
+    result = Titled("Depth on a plane", "recording", ["true mm", "frames", *titles])
     for row in rows:
         cells = [
             Text(number(value.value)).append(f"\n{interval(value)}".rstrip(), style="dim")
