@@ -51,7 +51,7 @@ CARRIED = {"position": "position", "diameter": "diameter", "tilt": "axis"}
 
 def number(value: float, digits: int = 2) -> str:
     """Return a number for people; a dash where it is not known."""
-    return f"{value:.{digits}f}" if math.isfinite(value) else "-"
+    return f"{round(value, digits) + 0.0:.{digits}f}" if math.isfinite(value) else "-"
 
 
 def interval(value: Value, digits: int = 2) -> str:

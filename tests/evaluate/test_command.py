@@ -193,6 +193,21 @@ def test_a_graph_is_run_and_judged(graph: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "must-not-be-written.mcap").exists()
 
 
+def test_a_source_that_knows_the_truth_needs_no_recording(graph: Path, tmp_path: Path) -> None:
+    (tmp_path / "beds.py").write_text(
+        "from mushpipe import ReplaySource\n"
+        "from tests.evaluate.scenes import bed, frame\n"
+        "class Beds(ReplaySource):\n"
+        "    def frames(self):\n"
+        "        yield from (frame(i, bed(i)) for i in range(2))\n"
+    )
+    graph.write_text(GRAPH.replace("{use: mcap, path: bed.mcap}", "{use: './beds.py:Beds'}"))
+    content = judged(graph, "--report", tmp_path / "report")
+    assert content["alternatives"][0]["overall"]["frames"] == 2
+    assert metrics(content)["f"] > 0.95
+    assert (tmp_path / "report" / "index.html").read_text().count("data:image/jpeg") == 2
+
+
 def test_recordings_may_follow_the_graph_and_folders_are_opened(
     graph: Path, tmp_path: Path, truths: dict[int, Any]
 ) -> None:
