@@ -109,7 +109,8 @@ class Judgement:
     @property
     def damage(self) -> list[str]:
         """What could not be read, in words."""
-        return [text for section in self.sections for text in section.evaluation.damage]
+        texts = [text for section in self.sections for text in section.evaluation.damage]
+        return list(dict.fromkeys(texts))
 
     @property
     def exit_code(self) -> int:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from mushpipe.core.truth import Ignore, Truth
 
@@ -43,6 +43,13 @@ class Cap(Circle):
     axis: Vector | None = None
     diameter_m: float | None = Field(None, gt=0)
     diameter_max_m: float | None = Field(None, gt=0)
+
+    @field_validator("axis")
+    @classmethod
+    def _direction(cls, axis: list[float] | None) -> list[float] | None:
+        if axis is not None and not any(axis):
+            raise ValueError("an axis needs a length")
+        return axis
 
 
 class Frame(BaseModel):

@@ -125,6 +125,16 @@ def test_conversion_leaves_the_own_format_alone() -> None:
         (
             {
                 "mushpipe_labels": 1,
+                "frames": [
+                    {"index": 0, "caps": [{"u": 1, "v": 1, "radius_px": 1, "axis": [0, 0, 0]}]}
+                ],
+            },
+            "an axis needs a length",
+        ),
+        ({"stamp_ns": 1, "caps": [5]}, "labels with 'caps'"),
+        (
+            {
+                "mushpipe_labels": 1,
                 "frames": [{"index": 4, "caps": [{"u": 1, "v": 1, "radius_px": 1, "id": 3}] * 2}],
             },
             "index=4: Truth: ids must be unique",
