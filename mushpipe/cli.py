@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mushpipe.evaluate.cli import register as register_eval
+
 if TYPE_CHECKING:
     from mushpipe.core.plan import Plan
 
@@ -88,7 +90,7 @@ def _execute(plan: Plan, manifest: Path | None, capsules: Path) -> int:
     with interruptible(stop), progress_bar() as show:
         report = run_plan(plan, stop, show, capsules)
     show_report(report)
-    if manifest is not None:
+    if manifest is not None and report.exit_code != 2:  # a wrong command line is no run
         manifest.parent.mkdir(parents=True, exist_ok=True)
         content = {**build_manifest(plan), "result": report.summary()}
         manifest.write_text(json.dumps(content, indent=2) + "\n")
@@ -250,6 +252,9 @@ def plugins_describe(
     from mushpipe.info import describe_plugin
 
     _out(describe_plugin(load_registry(), name))
+
+
+register_eval(app)
 
 
 def main() -> None:

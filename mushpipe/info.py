@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
+import json
 from pathlib import Path
 from typing import Any
-
-from pydantic_core import PydanticUndefined
 
 from mushpipe.core.errors import PluginError, suggest
 from mushpipe.core.plugins import Registry
@@ -19,7 +19,8 @@ def describe(path: Path) -> dict[str, Any]:
     """Read a recording to its end and describe it; ``damage`` is empty where it is whole.
 
     Raises:
-        InputError: The file is missing, empty, or not MCAP at all.
+        UsageError: There is no such file.
+        InputError: It is empty, or not MCAP at all.
     """
     reader = RecordingReader(path)
     index = reader.index()
@@ -126,22 +127,34 @@ def _describe_class(kind: Kind, name: str, plugin: type[Plugin]) -> str:
         for port in ports.inputs
     ]
     outputs = [output.__name__ for output in ports.outputs]
-    lines = [f"{kind} {name}", "", (plugin.__doc__ or "").strip(), ""]
+    lines = [f"{kind} {name}", "", inspect.getdoc(plugin) or "", ""]
     lines.append(f"inputs   {', '.join(inputs) or 'none'}")
     lines.append(f"outputs  {', '.join(outputs) or 'none'}")
     rows = [
-        (key, _annotation(field.annotation), _default(field), field.description or "")
-        for key, field in plugin.model_fields.items()
+        (key, _type(field), _default(field), field.get("description", ""))
+        for key, field in plugin.model_json_schema().get("properties", {}).items()
     ]
     if rows:
         lines += ["", *_columns([("setting", "type", "default", "meaning"), *rows], "")]
     return "\n".join(lines)
 
 
-def _annotation(annotation: Any) -> str:
-    text = annotation.__name__ if isinstance(annotation, type) else str(annotation)
-    return text.replace("typing.", "").replace("pathlib.", "").replace("mushpipe.sources.", "")
+_BOUNDS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
 
 
-def _default(field: Any) -> str:
-    return "required" if field.default is PydanticUndefined else str(field.default)
+def _type(schema: dict[str, Any]) -> str:
+    """Say in a few words what a JSON Schema allows."""
+    if "enum" in schema:
+        return " | ".join(map(str, schema["enum"]))
+    if "anyOf" in schema:
+        return " | ".join(_type(option) for option in schema["anyOf"])
+    if "prefixItems" in schema:
+        return f"[{', '.join(_type(item) for item in schema['prefixItems'])}]"
+    if "$ref" in schema:
+        return str(schema["$ref"].rpartition("/")[2])
+    bounds = [f" {sign} {schema[key]:g}" for key, sign in _BOUNDS.items() if key in schema]
+    return str(schema.get("format", schema.get("type", "any"))) + "".join(bounds)
+
+
+def _default(schema: dict[str, Any]) -> str:
+    return json.dumps(schema["default"]) if "default" in schema else "required"

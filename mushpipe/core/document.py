@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +14,20 @@ from mushpipe.core.errors import GraphError, Problem
 
 Location = tuple[str | int, ...]
 MAX_NODES = 20_000
+MAX_DEPTH = 50
+# What PyYAML raises on text that is no YAML: an escape like "\UFFFFFFFF" is an OverflowError.
+_UNREADABLE = (yaml.YAMLError, RecursionError, ValueError, OverflowError)
+_COLLECTIONS = {"map", "seq"}
 _SCALARS = {"null", "bool", "int", "float", "str", "timestamp"}
+
+
+class _Loader(yaml.SafeLoader):
+    """Reads 1e-3 as a number, as YAML 1.2 and people do; YAML 1.1 wants 1.0e-3."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+$"), list("-+0123456789")
+)
 
 
 @dataclass
@@ -68,14 +82,14 @@ def parse_document(text: str, file: str, base: Path) -> Document:
     """Parse YAML text; see `read_document`."""
     document = Document(file, base, lines=text.splitlines())
     try:
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
+        root = yaml.compose(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line, column = (mark.line + 1, mark.column + 1) if mark else (0, 0)
         excerpt = document._excerpt(line) if line else ""
         message = f"not valid YAML: {error.problem or error.context}"
         raise GraphError([Problem(file, line, column, message, "", excerpt)]) from error
-    except (yaml.YAMLError, RecursionError) as error:
+    except _UNREADABLE as error:
         reason = "it is nested too deeply" if isinstance(error, RecursionError) else error
         raise GraphError([Problem(file, 0, 0, f"not valid YAML: {reason}")]) from error
     builder = _Builder(document)
@@ -86,6 +100,23 @@ def parse_document(text: str, file: str, base: Path) -> Document:
         raise GraphError(builder.problems)
     document.data = data
     return document
+
+
+def parse_value(text: str, label: str) -> Any:
+    """Return the data that a YAML value means; text that is no YAML stands for itself.
+
+    Raises:
+        GraphError: It is YAML, but not plain data; the label says where it comes from.
+    """
+    try:
+        root = yaml.compose(text, Loader=_Loader)
+    except _UNREADABLE:
+        return text
+    builder = _Builder(Document(label, Path()))
+    value = builder.build(root, ()) if root else None
+    if builder.problems:
+        raise GraphError(Problem(label, 0, 0, problem.message) for problem in builder.problems)
+    return value
 
 
 class _Builder:
@@ -100,18 +131,25 @@ class _Builder:
     def build(self, node: yaml.Node, at: Location) -> Any:
         self.document.values[at] = (node.start_mark.line + 1, node.start_mark.column + 1)
         self.nodes += 1
-        if self.nodes > MAX_NODES or len(at) > 50:
+        if self.nodes > MAX_NODES or len(at) > MAX_DEPTH:
             if self.nodes >= 0:
-                self._object(at, "too large after its aliases are expanded")
+                deep = len(at) > MAX_DEPTH
+                self._object(
+                    at, "nested too deeply" if deep else "too large after its aliases are expanded"
+                )
             self.nodes = -(10**9)  # said once; unwind without building more
             return None
         if self.nodes < 0:
+            return None
+        tag = node.tag.removeprefix("tag:yaml.org,2002:")
+        if tag not in (_SCALARS if isinstance(node, yaml.ScalarNode) else _COLLECTIONS):
+            self._object(at, f"the tag '{node.tag}' is not allowed: plain values only")
             return None
         if isinstance(node, yaml.MappingNode):
             return dict(self._pairs(node, at))
         if isinstance(node, yaml.SequenceNode):
             return [self.build(item, (*at, i)) for i, item in enumerate(node.value)]
-        return self._scalar(node, at)
+        return self._scalar(node, tag, at)
 
     def _pairs(self, node: yaml.MappingNode, at: Location) -> Iterator[tuple[str, Any]]:
         seen: set[str] = set()
@@ -135,17 +173,13 @@ class _Builder:
             self.document.keys[(*at, key)] = mark
             yield key, self.build(value_node, (*at, key))
 
-    def _scalar(self, node: yaml.Node, at: Location) -> Any:
-        tag = node.tag.removeprefix("tag:yaml.org,2002:")
-        if tag not in _SCALARS:
-            self._object(at, f"the tag '{node.tag}' is not allowed: plain values only")
-            return None
+    def _scalar(self, node: yaml.Node, tag: str, at: Location) -> Any:
         if tag == "timestamp":
             return node.value
         try:
             return self.loader.construct_object(node)
-        except (ValueError, yaml.YAMLError) as error:
-            self._object(at, f"not a valid {tag}: {error}")
+        except (ValueError, LookupError, yaml.YAMLError):
+            self._object(at, f"not a valid {tag}: '{node.value}'")
             return None
 
     def _object(self, at: Location, message: str) -> None:

@@ -95,4 +95,4 @@ def suggest(name: str, known: Sequence[str]) -> str:
     near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
     if near:
         return f"did you mean '{near[0]}'?"
-    return f"known: {', '.join(known)}" if known else "there are none"
+    return f"known: {', '.join(known)}" if known else "none is known here"

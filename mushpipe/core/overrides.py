@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-import yaml
-
-from mushpipe.core.document import Document, Location
-from mushpipe.core.errors import Problem, suggest
+from mushpipe.core.document import Document, Location, parse_value
+from mushpipe.core.errors import GraphError, Problem, suggest
 
 _TOP = ("seed", "on_error", "max_failures", "source", "stages", "sinks")
 
@@ -24,9 +22,9 @@ def apply_override(document: Document, text: str, label: str = "") -> list[Probl
     if not equals:
         return [Problem(label, 0, 0, "expected a.b=value")]
     try:
-        value = yaml.safe_load(value_text)
-    except yaml.YAMLError:
-        value = value_text
+        value = parse_value(value_text, label)
+    except GraphError as error:
+        return error.problems
     at, message = _locate(document, path.strip())
     if message:
         return [Problem(label, 0, 0, message)]

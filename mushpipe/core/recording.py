@@ -2,29 +2,36 @@
 
 from __future__ import annotations
 
+import os
 import struct
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 from mcap.exceptions import InvalidMagic, McapError
 from mcap.reader import SeekingReader
-from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schema, Statistics
+from mcap.records import Attachment, Channel, Chunk, DataEnd, McapRecord, Metadata, Schema
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 from zstandard import ZstdError
 
 from mushpipe.core import wire
-from mushpipe.core.errors import InputError
+from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.geometry import Camera
 from mushpipe.core.types import Header, RgbdFrame
 
 # What mcap's reader raises on bytes that are not what they claim to be.
-_GARBAGE = (McapError, ValueError, struct.error, ZstdError, RuntimeError, MemoryError, TypeError)
+_GARBAGE = (
+    *(McapError, ValueError, struct.error, ZstdError, RuntimeError, MemoryError, TypeError),
+    *(OverflowError, LookupError, OSError),
+)
+# opcode, length, start of the summary, start of its offsets, CRC of all from that start to here
+_FOOTER = struct.Struct("<BQQQI")
 MANIFEST = "mushpipe.manifest"
 SUMMARY = "mushpipe.summary"
 GRAPH = "mushpipe.graph"
@@ -43,6 +50,7 @@ class Index:
     """What a file holds, without its messages."""
 
     channels: dict[str, Channel] = field(default_factory=dict)
+    by_id: dict[int, Channel] = field(default_factory=dict)
     schemas: dict[int, Schema] = field(default_factory=dict)
     counts: Counter[str] = field(default_factory=Counter)
     start_ns: int = 0
@@ -57,23 +65,25 @@ class Index:
 
 
 class RecordingReader:
-    """Reads an MCAP file from front to back, chunk by chunk, checking every CRC.
+    """Reads an MCAP file from front to back, chunk by chunk, checking the CRC of each.
 
     Messages come in file order, sorted by log time within a chunk. ``damage`` says afterwards,
     in words, what could not be read.
 
     Raises:
-        InputError: The file is missing, empty, or not MCAP at all.
+        UsageError: There is no such file.
+        InputError: It is empty, or not MCAP at all.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.damage: list[str] = []
+        self._index: Index | None = None
         try:
             with path.open("rb") as file:
                 magic = file.read(8)
         except FileNotFoundError:
-            raise InputError(f"{path}: there is no such recording") from None
+            raise UsageError(f"{path}: there is no such recording") from None
         except OSError as error:
             raise InputError(f"{path}: cannot be read: {error.strerror}") from error
         if not magic:
@@ -85,8 +95,9 @@ class RecordingReader:
         self, topics: set[str] | None = None, start_ns: int = 0, end_ns: int | None = None
     ) -> Iterator[Raw]:
         """Yield the messages of some topics (default all) with start_ns <= log_time < end_ns."""
-        channels: dict[int, Channel] = {}
-        schemas: dict[int, Schema] = {}
+        index, seen = self.index(), 0
+        # A chunk that is skipped or corrupt may be the one that declares them.
+        channels, schemas = dict(index.by_id), dict(index.schemas)
 
         def wanted(time: int) -> bool:
             return time >= start_ns and (end_ns is None or time < end_ns)
@@ -101,18 +112,26 @@ class RecordingReader:
             elif isinstance(record, Channel):
                 channels[record.id] = record
             elif isinstance(record, McapMessage):
+                seen += 1
                 channel = channels.get(record.channel_id)
                 if channel is None:
                     self._note("a message belongs to no channel")
                 elif wanted(record.log_time) and (topics is None or channel.topic in topics):
                     yield Raw(channel, schemas.get(channel.schema_id), record)
+        if not start_ns and end_ns is None and seen < index.counts.total() and not self.damage:
+            self._note(f"{index.counts.total() - seen} of its messages are missing")
 
     def _records(self, wanted: Callable[[Chunk], bool]) -> Iterator[McapRecord]:
         with self.path.open("rb") as file:
             limit = self.path.stat().st_size
             reader = StreamReader(file, emit_chunks=True, record_size_limit=limit)
+            in_summary = False
             try:
                 for record in reader.records:
+                    # What the summary repeats was read already; it goes on to the last byte.
+                    in_summary |= isinstance(record, DataEnd)
+                    if in_summary:
+                        continue
                     if not isinstance(record, Chunk):
                         yield record
                     elif wanted(record):
@@ -141,22 +160,38 @@ class RecordingReader:
 
     def index(self) -> Index:
         """Return what the file holds; from its summary, or by reading it all if that is lost."""
-        try:
-            return self._index_from_summary()
-        except _GARBAGE:
-            return self._index_by_scan()
+        if self._index is None:
+            try:
+                self._index = self._index_from_summary()
+            except _GARBAGE:
+                self._index = self._index_by_scan()
+        return self._index
+
+    def _check_summary(self, file: BinaryIO) -> None:
+        """Raise ValueError where there is no summary, or its CRC does not match."""
+        end = file.seek(-_FOOTER.size - 8, os.SEEK_END)
+        start, _, crc = _FOOTER.unpack(file.read(_FOOTER.size))[2:]
+        if not 0 < start <= end:
+            raise ValueError("no summary")
+        file.seek(start)
+        if crc and zlib.crc32(file.read(end + _FOOTER.size - 4 - start)) != crc:
+            self._note("its index is corrupt")
+            raise ValueError("corrupt summary")
 
     def _index_from_summary(self) -> Index:
         with self.path.open("rb") as file:
+            self._check_summary(file)
+            file.seek(0)
             reader = SeekingReader(file, record_size_limit=self.path.stat().st_size)
             summary = reader.get_summary()
-            if summary is None or not isinstance(summary.statistics, Statistics):
+            if summary is None or summary.statistics is None:
                 raise ValueError("no summary")
             counts: Counter[str] = Counter()
             for channel_id, count in summary.statistics.channel_message_counts.items():
                 counts[summary.channels[channel_id].topic] += count
             return Index(
                 channels={c.topic: c for c in summary.channels.values()},
+                by_id=dict(summary.channels),
                 schemas=dict(summary.schemas),
                 counts=counts,
                 start_ns=summary.statistics.message_start_time,
@@ -167,17 +202,16 @@ class RecordingReader:
 
     def _index_by_scan(self) -> Index:
         index = Index()
-        topics: dict[int, str] = {}
         for record in self._records(lambda _: True):
             if isinstance(record, Schema):
                 index.schemas[record.id] = record
             elif isinstance(record, Channel):
-                topics[record.id] = record.topic
+                index.by_id[record.id] = record
                 index.channels[record.topic] = record
-            elif isinstance(record, McapMessage) and record.channel_id in topics:
+            elif isinstance(record, McapMessage) and record.channel_id in index.by_id:
                 if not index.counts:
                     index.start_ns = record.log_time
-                index.counts[topics[record.channel_id]] += 1
+                index.counts[index.by_id[record.channel_id].topic] += 1
                 index.start_ns = min(index.start_ns, record.log_time)
                 index.end_ns = max(index.end_ns, record.log_time)
             elif isinstance(record, Metadata):

@@ -42,6 +42,10 @@ class RerunSink(Sink):
         if self.save:
             self._recording.save(str(run.path(self.save)))
         self._recording.send_blueprint(_blueprint())
+        classes = [(0, "bed", (0, 0, 0, 0)), (1, "mushroom", (60, 220, 90, 255))]
+        for layer in ("mask", "initial"):
+            context = rr.AnnotationContext(classes)
+            self._recording.log(f"{_IMAGE}/{layer}", context, static=True)
 
     def consume(
         self,
@@ -55,11 +59,34 @@ class RerunSink(Sink):
 
         rec = self._recording
         rec.set_time("frame", sequence=frame.header.sequence)
-        rec.set_time("capture", timestamp=frame.header.stamp_ns / 1e9)
+        rec.set_time("capture", timestamp=np.datetime64(frame.header.stamp_ns, "ns"))
+        self._log_frame(frame)
+        if mask is not None:
+            rec.log(f"{_IMAGE}/mask", rr.SegmentationImage(mask.foreground.astype(np.uint8)))
+            if mask.initial is not None:
+                initial = rr.SegmentationImage(mask.initial.astype(np.uint8))
+                rec.log(f"{_IMAGE}/initial", initial)
+        if circles is not None:
+            same = picks if picks is not None and len(picks) == len(circles) else None
+            ellipses = rr.Ellipses2D(
+                centers=circles.center,
+                half_sizes=np.repeat(circles.radius[:, None], 2, axis=1),
+                colors=_colors(same, circles),
+                labels=None if same is None else _labels(same),
+            )
+            rec.log(f"{_IMAGE}/circles", ellipses)
+        if picks is not None:
+            known = picks.source != DepthSource.MISSING
+            radii = np.nan_to_num(picks.diameter[known]) / 2
+            rec.log("camera/picks", rr.Points3D(picks.position[known], radii=radii))
+
+    def _log_frame(self, frame: RgbdFrame) -> None:
+        import rerun as rr
+
+        rec, camera = self._recording, frame.camera
         color = rr.Image(frame.color).compress(jpeg_quality=self.jpeg_quality)
         rec.log(f"{_IMAGE}/color", color)
-        if frame.camera is not None:
-            camera = frame.camera
+        if camera is not None:
             pinhole = rr.Pinhole(
                 focal_length=(camera.fx, camera.fy),
                 principal_point=(camera.cx, camera.cy),
@@ -68,30 +95,10 @@ class RerunSink(Sink):
             )
             rec.log(_IMAGE, pinhole)
         if frame.depth is not None:
-            rec.log(f"{_IMAGE}/depth", rr.DepthImage(frame.depth, meter=1 / frame.depth_scale))
-        if mask is not None:
-            rec.log(f"{_IMAGE}/mask", rr.SegmentationImage(mask.foreground.astype(np.uint8)))
-            if mask.initial is not None:
-                initial = rr.SegmentationImage(mask.initial.astype(np.uint8))
-                rec.log(f"{_IMAGE}/initial", initial)
-        if circles is not None:
-            labels = _labels(picks) if picks is not None and len(picks) == len(circles) else None
-            rec.log(
-                f"{_IMAGE}/circles",
-                rr.Ellipses2D(
-                    centers=circles.center,
-                    half_sizes=np.repeat(circles.radius[:, None], 2, axis=1),
-                    colors=_colors(picks, circles),
-                    labels=labels,
-                    show_labels=False,
-                ),
-            )
-        if picks is not None:
-            known = picks.source != DepthSource.MISSING
-            rec.log(
-                "camera/picks",
-                rr.Points3D(picks.position[known], radii=np.nan_to_num(picks.diameter[known]) / 2),
-            )
+            known = frame.depth[frame.depth > 0]
+            reach = np.percentile(known, (1, 99)) if known.size else None
+            depth = rr.DepthImage(frame.depth, meter=1 / frame.depth_scale, depth_range=reach)
+            rec.log(f"{_IMAGE}/depth", depth)
 
     def close(self) -> None:
         """Finish the file."""

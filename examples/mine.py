@@ -1,0 +1,16 @@
+"""A segmenter of one's own in one file: use it in a graph as `use: ./mine.py:Brightest`."""
+
+import numpy as np
+from pydantic import Field
+
+from mushpipe import Mask, RgbdFrame, Stage
+
+
+class Brightest(Stage):
+    """Caps are the brightest part of the image."""
+
+    share: float = Field(0.2, gt=0, lt=1, description="share of the pixels that are cap")
+
+    def process(self, frame: RgbdFrame) -> Mask:
+        """Return the pixels above the quantile."""
+        return Mask(frame.gray > np.quantile(frame.gray, 1 - self.share))

@@ -1,0 +1,249 @@
+"""The commands as a user types them: exit codes, stdout, stderr."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from mushpipe.core.errors import EXIT_DAMAGED, EXIT_FAILED, EXIT_USAGE
+
+ROOT = Path(__file__).parents[2]
+PICK_KEYS = [
+    "id",
+    "u",
+    "v",
+    "radius_px",
+    "position_m",
+    "distance_m",
+    "diameter_m",
+    "quaternion_xyzw",
+    "axis",
+    "score",
+    "sigma_tilt_rad",
+    "depth_source",
+    "flags",
+]
+GRAPH = """\
+mushpipe: 1
+source: {use: synthetic, max_frames: 3, count: 12}
+stages:
+  segment: {use: otsu}
+  open:    {use: opening}
+  detect:  {use: hough}
+  locate:  {use: nearest-depth}
+  pick:    {use: picks}
+sinks:
+  log: {use: mcap, path: out.mcap}
+"""
+
+
+def mushpipe(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
+    code = "from mushpipe.cli import main; main()"
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "graph.yaml").write_text(GRAPH)
+    return tmp_path
+
+
+def test_run_writes_results_and_manifest_and_prints_the_balance(folder: Path) -> None:
+    done = mushpipe("run", "graph.yaml", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == ""
+    assert "3 frames in = 3 processed + 0 dropped + 0 failed" in done.stderr
+    assert "p95 ms" in done.stderr
+    manifest = json.loads((folder / "out.run.json").read_text())
+    assert manifest["graph"]["stages"]["open"] == {"use": "opening", "size": 10}
+    assert manifest["result"]["frames"] == {
+        "in": 3,
+        "processed": 3,
+        "dropped": 0,
+        "failed": 0,
+        "balanced": True,
+    }
+
+
+def test_export_prints_one_json_line_per_frame(folder: Path) -> None:
+    mushpipe("run", "graph.yaml", cwd=folder)
+    done = mushpipe("export", "out.mcap", cwd=folder)
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [line["sequence"] for line in lines] == [0, 1, 2]
+    assert set(lines[0]) == {"stamp_ns", "sequence", "frame_id", "picks"}
+    pick = lines[0]["picks"][0]
+    assert list(pick) == PICK_KEYS
+    assert pick["quaternion_xyzw"] is None
+    assert pick["flags"][0] == "pose_unknown"
+    table = mushpipe("export", "out.mcap", "--format", "csv", cwd=folder).stdout.splitlines()
+    assert table[0].startswith("stamp_ns,sequence,frame_id,id,u,v,radius_px,x_m,y_m,z_m")
+    assert len(table) == 1 + sum(len(line["picks"]) for line in lines)
+
+
+def test_record_then_replay_by_source_with_paths_relative_to_the_shell(folder: Path) -> None:
+    recorded = mushpipe(
+        "record", "--source", "synthetic", "--frames", 2, "-o", "a.mcap", cwd=folder
+    )
+    assert recorded.returncode == 0, recorded.stderr
+    (folder / "elsewhere").mkdir()
+    done = mushpipe(
+        *("run", "../graph.yaml", "--source", "../a.mcap", "--set", "log.path=here.mcap"),
+        cwd=folder / "elsewhere",
+    )
+    assert done.returncode == 0, done.stderr
+    assert (folder / "elsewhere/here.mcap").exists()
+    assert not (folder / "out.mcap").exists()
+
+
+def test_faults_of_a_graph_are_printed_together_with_places(folder: Path) -> None:
+    (folder / "bad.yaml").write_text(
+        GRAPH.replace("otsu", "osu").replace("opening}", "opening, sise: 3}")
+    )
+    done = mushpipe("validate", "bad.yaml", cwd=folder)
+    assert done.returncode == EXIT_USAGE
+    assert done.stderr == (
+        "error: bad.yaml:4:18: unknown stage 'osu'; did you mean 'otsu'?\n"
+        "      segment: {use: osu}\n"
+        "                     ^\n"
+        "bad.yaml:5:27: unknown setting 'sise' of 'opening'\n"
+        "      open:    {use: opening, sise: 3}\n"
+        "                              ^\n"
+        "    did you mean 'size'?\n"
+    )
+    listed = json.loads(mushpipe("validate", "bad.yaml", "--format", "json", cwd=folder).stdout)
+    assert [(p["line"], p["column"]) for p in listed["problems"]] == [(4, 18), (5, 27)]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["run", "nope.yaml"], EXIT_USAGE, "error: nope.yaml: there is no such file\n"),
+        (
+            ["run", "graph.yaml", "--source", "nope.mcap"],
+            EXIT_USAGE,
+            "error: nope.mcap: there is no such recording\n",
+        ),
+        (
+            ["run", "graph.yaml", "--source", "empty.mcap"],
+            EXIT_DAMAGED,
+            "error: empty.mcap: the file is empty\n",
+        ),
+        (
+            ["run", "graph.yaml", "--start", "3"],
+            EXIT_USAGE,
+            "error: --start 3.0: unknown setting 'start' of 'synthetic'\n",
+        ),
+        (
+            ["run", "graph.yaml", "--set", "segmnt.x=1"],
+            EXIT_USAGE,
+            "error: --set segmnt.x=1: unknown path 'segmnt.x'; did you mean 'segment'?\n",
+        ),
+        (
+            ["info", "graph.yaml"],
+            EXIT_DAMAGED,
+            "error: graph.yaml: not an MCAP file (it begins with b'mushpipe')\n",
+        ),
+        (
+            ["plugins", "describe", "otsi"],
+            EXIT_USAGE,
+            "error: there is no plugin 'otsi'; did you mean 'otsu'?\n",
+        ),
+    ],
+)
+def test_errors_name_what_is_wrong(
+    folder: Path, arguments: list[str], code: int, message: str
+) -> None:
+    (folder / "empty.mcap").touch()
+    done = mushpipe(*arguments, cwd=folder)
+    assert message in done.stderr
+    assert done.returncode == code
+    assert not (folder / "out.mcap").exists()
+
+
+def test_a_failing_stage_leaves_a_capsule_that_fails_again(folder: Path) -> None:
+    (folder / "mine.py").write_text(
+        "from mushpipe import Mask, RgbdFrame, Stage\n\n"
+        "class Picky(Stage):\n"
+        "    def process(self, frame: RgbdFrame) -> Mask:\n"
+        "        if frame.header.sequence == 1:\n"
+        "            raise RuntimeError('no frame like this')\n"
+        "        return Mask(frame.gray > 0.5)\n"
+    )
+    done = mushpipe("run", "graph.yaml", "--set", "segment.use=./mine.py:Picky", cwd=folder)
+    assert done.returncode == EXIT_FAILED
+    assert "failed on frame 1: RuntimeError: no frame like this" in done.stderr
+    assert "1 failed" in done.stderr
+    again = mushpipe("run", "failures/failure-segment-1.mcap", cwd=folder)
+    assert again.returncode == EXIT_FAILED
+    assert "failed on frame 1: RuntimeError: no frame like this" in again.stderr
+
+
+def test_a_recording_is_no_graph(folder: Path) -> None:
+    mushpipe("run", "graph.yaml", cwd=folder)
+    done = mushpipe("run", "out.mcap", cwd=folder)
+    assert done.returncode == EXIT_USAGE
+    assert "mushpipe run GRAPH --source out.mcap" in done.stderr
+
+
+def test_pictures_and_listings(folder: Path) -> None:
+    assert "n1 -->|Mask| n2" in mushpipe("graph", "graph.yaml", cwd=folder).stdout
+    assert '"segment" -> "open" [label="Mask"]' in (
+        mushpipe("graph", "graph.yaml", "--format", "dot", cwd=folder).stdout
+    )
+    rows = json.loads(mushpipe("plugins", "list", "--format", "json", cwd=folder).stdout)
+    assert {"kind": "stage", "name": "otsu", "from": "mushpipe 0.1.0", "problem": ""} in rows
+    described = mushpipe("plugins", "describe", "opening", cwd=folder).stdout
+    assert "inputs   mask: Mask" in described
+    assert "integer >= 1 <= 255" in described
+
+
+@pytest.mark.parametrize("heavy", ["open3d", "rerun", "scipy", "cv2", "pyrealsense2"])
+def test_help_imports_nothing_heavy(heavy: str) -> None:
+    code = (
+        "import sys; sys.argv = ['mushpipe', '--help']\n"
+        "from mushpipe.cli import main\n"
+        "try: main()\n"
+        f"except SystemExit: sys.exit('{heavy}' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
+
+
+@pytest.mark.parametrize("graph", sorted((ROOT / "graphs").glob("*.yaml")), ids=lambda p: p.stem)
+def test_the_graphs_of_the_project_run(graph: Path, tmp_path: Path) -> None:
+    sinks = ["--set", f"log.path={tmp_path / 'log.mcap'}"]
+    if "view:" in graph.read_text():
+        sinks += ["--set", f"view.save={tmp_path / 'view.rrd'}"]
+    done = mushpipe("run", graph, "--frames", 1, *sinks, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    picks = json.loads(mushpipe("export", tmp_path / "log.mcap", cwd=tmp_path).stdout)["picks"]
+    assert len(picks) > 10
+
+
+def test_a_recording_is_never_written_over_by_its_own_run(folder: Path) -> None:
+    mushpipe("record", "--source", "synthetic", "--frames", 1, "-o", "a.mcap", cwd=folder)
+    before = (folder / "a.mcap").read_bytes()
+    done = mushpipe("record", "--source", "a.mcap", "-o", "./a.mcap", cwd=folder)
+    assert done.returncode == EXIT_USAGE
+    assert "sink 'recorder' would write over its own source" in done.stderr
+    assert (folder / "a.mcap").read_bytes() == before
+
+
+def test_the_results_of_a_failed_run_say_how_it_ended(folder: Path) -> None:
+    (folder / "mine.py").write_text(
+        "from mushpipe import Mask, RgbdFrame, Stage\n\n"
+        "class Picky(Stage):\n"
+        "    def process(self, frame: RgbdFrame) -> Mask:\n"
+        "        raise RuntimeError('never')\n"
+    )
+    mushpipe("run", "graph.yaml", "--set", "segment.use=./mine.py:Picky", cwd=folder)
+    with (folder / "out.mcap").open("rb") as file:
+        metadata = {m.name: m.metadata for m in make_reader(file).iter_metadata()}
+    summary = json.loads(metadata["mushpipe.summary"]["json"])
+    assert summary["exit_code"] == EXIT_FAILED
+    assert summary["frames"]["failed"] == 1

@@ -1,0 +1,57 @@
+"""Ctrl-C and SIGTERM: once finishes the frame and closes the files."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from mushpipe.core.errors import EXIT_INTERRUPTED
+
+GRAPH = """\
+mushpipe: 1
+source: {use: synthetic, max_frames: 1000000, count: 3}
+stages:
+  say: {use: "./say.py:Say"}
+sinks:
+  log: {use: mcap, path: out.mcap, frames: false}
+"""
+# Tells on stdout that a frame is being processed, so that the test need not guess by time.
+SAY = """\
+import sys
+from mushpipe import Mask, RgbdFrame, Stage
+
+class Say(Stage):
+    def process(self, frame: RgbdFrame) -> Mask:
+        sys.stdout.write("frame\\n"); sys.stdout.flush()
+        return Mask(frame.gray > 0.5)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_one_signal_ends_the_run_in_order(tmp_path: Path, number: signal.Signals) -> None:
+    (tmp_path / "graph.yaml").write_text(GRAPH)
+    (tmp_path / "say.py").write_text(SAY)
+    code = "from mushpipe.cli import main; main()"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, "run", "graph.yaml"],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "frame\n"
+    process.send_signal(number)
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == EXIT_INTERRUPTED, stderr
+    assert f"{number.name}: finishing this frame" in stderr
+    with (tmp_path / "out.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    assert f"{summary.statistics.message_count // 2} processed" in stderr
