@@ -5,23 +5,14 @@ One thread, so that the same rays give the same bytes.
 
 from __future__ import annotations
 
-import importlib
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.errors import DependencyError
+from mushpipe.core.libraries import import_open3d
 from mushpipe.sim.mesh import Ints
 from mushpipe.sim.noise import Floats, Reals, Singles
-
-
-def _open3d() -> Any:
-    try:
-        return importlib.import_module("open3d")
-    except (ImportError, OSError) as error:
-        cure = "apt-get install libegl1 libgl1 libusb-1.0-0"
-        raise DependencyError(f"open3d cannot be imported ({error}): {cure}") from error
 
 
 class Raycaster:
@@ -39,7 +30,7 @@ class Raycaster:
     """
 
     def __init__(self, vertices: Floats, triangles: Ints) -> None:
-        self._core = _open3d()
+        self._core = import_open3d()
         self._scene = self._core.t.geometry.RaycastingScene(nthreads=1)
         self._scene.add_triangles(
             self._tensor(vertices.astype(np.float32)), self._tensor(triangles.astype(np.uint32))

@@ -1,34 +1,22 @@
-"""Small hand-made scenes whose truth is known in closed form."""
+"""A plane under a small camera, and mushrooms put on it one by one."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 
 from mushpipe.sim.mesh import Material
-from mushpipe.sim.mushroom import Kind, Mushroom
+from mushpipe.sim.mushroom import Mushroom
 from mushpipe.sim.planting import Area
 from mushpipe.sim.settings import SceneSettings
-from mushpipe.sim.shapes import CapShape, Warp
 from mushpipe.sim.table import target
 from mushpipe.sim.world import World, assemble
-
-BALL = CapShape("a", 1.0, (2.0,), 1.0, 0.999, True, Warp())
 
 
 @pytest.fixture(autouse=True)
 def _open3d() -> None:
     pytest.importorskip("open3d", reason="open3d needs libGL and libEGL", exc_type=ImportError)
-
-
-def ball(center, radius, axis=(0.0, 0.0, 1.0), kind=Kind.GROWING, shape=BALL) -> Mushroom:
-    """A mushroom whose cap is a whole sphere."""
-    center, axis = np.array(center, float), np.array(axis, float)
-    foot = center * [1, 1, 0]
-    axis /= np.linalg.norm(axis)
-    return Mushroom(kind, center, axis, 0.3, radius, shape, foot, radius / 3, (0.8, 0.8, 0.8))
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from mushpipe.sim.raycast import Raycaster, rays
 from mushpipe.sim.render import look
 from mushpipe.sim.shapes import CapShape, Warp, draw_shape
 from mushpipe.sim.world import view_at
-from tests.sim.conftest import BALL, ball
+from tests.sim.scenes import BALL, ball
 
 
 def truth_of(settings, world, along=0.0, largest=80.0):
