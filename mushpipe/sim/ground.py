@@ -79,8 +79,10 @@ def grid_shape(area: Area, texel: float) -> tuple[int, int]:
     )
 
 
-def soil(area: Area, texel: float, mycelium: float, rng: np.random.Generator) -> Ground:
-    """Return dark, crumbly casing soil, overgrown with mycelium to a share of 0..1."""
+def soil(
+    area: Area, texel: float, bright: float, mycelium: float, rng: np.random.Generator
+) -> Ground:
+    """Return crumbly casing soil, overgrown with mycelium to a share of 0..1."""
     shape = grid_shape(area, texel)
 
     def noise(grain: float) -> Singles:
@@ -92,7 +94,7 @@ def soil(area: Area, texel: float, mycelium: float, rng: np.random.Generator) ->
     tone = 0.30 * noise(0.0009) + 0.22 * noise(0.004) + 0.22 * noise(0.02) + 0.12 * crumbs
     red = 0.06 * noise(0.006)
     peat, clay = np.array([0.026, 0.022, 0.019]), np.array([0.021, 0.0225, 0.0245])
-    base = (peat + rng.uniform(0, 1) * (clay - peat)).astype(np.float32)
+    base = (bright * (peat + rng.uniform(0, 1) * (clay - peat))).astype(np.float32)
     tilt = np.stack([1 + red, np.ones(shape), 1 - red], axis=-1)
     albedo = (base * np.exp(tone)[..., None] * tilt).astype(np.float32)
     _fibres(albedo, texel, area, rng)
@@ -178,6 +180,9 @@ def litter(ground: Ground, area: Area, density: float, rng: np.random.Generator)
     for share, rings, material in ((0.94, 7, Material.CLOD), (0.06, 9, Material.STONE)):
         flat = area.draw(rng, round(share * density * area.size))
         radius = 0.0015 + 0.0065 * rng.beta(1, 4.5, len(flat))
+        # a few as large as small caps: what detectors mistake for one
+        large = rng.random(len(flat)) < 0.025
+        radius[large] = rng.uniform(0.005, 0.010, int(large.sum()))
         z = ground.height_at(flat) + radius * rng.uniform(-0.2, 0.5, len(flat))
         spots = np.column_stack([flat, z])
         pieces += _scatter(_lumps(rng, rings, material), spots, radius, rng)

@@ -112,7 +112,7 @@ class Painter:
 
     def _even(self, surface: Surface, rows: Ints) -> Singles:
         color = np.asarray(_PLAIN[Material(surface.material[rows[0]])], np.float32)
-        tone = 1 + 0.1 * self._at(surface, rows, 0.001) + 0.08 * self._at(surface, rows, 0.012)
+        tone = 1 + 0.05 * self._at(surface, rows, 0.001) + 0.10 * self._at(surface, rows, 0.012)
         return np.asarray(color * tone[:, None], np.float32)
 
     def _cap(self, surface: Surface, rows: Ints) -> Singles:
@@ -123,11 +123,12 @@ class Painter:
         color = (self._tint[owner] * tone[:, None]).astype(np.float32)
         bare = ~self._plain[owner]
         scales = self._scales(surface, rows) * self._scaly[owner]
-        color = mix(color, (0.185, 0.112, 0.066), scales.astype(np.float32) * 0.75)
+        color = mix(color, (0.13, 0.078, 0.046), scales.astype(np.float32) * 0.75)
         pale = smoothstep(0.05, -0.25, (q[:, 2] / self._radius[owner]).astype(np.float32))
         color = mix(color, (0.76, 0.70, 0.60), 0.5 * pale * (self._scaly[owner] > 0.3))
-        stain = smoothstep(1.5, 2.6, self._at(surface, rows, 0.014, 7)) * bare
-        color = mix(color, (0.50, 0.37, 0.20), 0.45 * stain)
+        spread = self._at(surface, rows, 0.016, 7) + 0.35 * self._at(surface, rows, 0.004, 8)
+        stain = smoothstep(1.3, 3.2, spread) * bare
+        color = mix(color, (0.50, 0.37, 0.20), 0.5 * stain)
         return mix(color, _CRUMB, self._crumbs(surface, rows) * bare)
 
     def _fibres(self, surface: Surface, rows: Ints) -> Singles:
@@ -185,7 +186,7 @@ class Painter:
         base = self._ground(surface, rows).mean(axis=1, keepdims=True)
         tone = np.exp(0.4 * self._at(surface, rows, 0.0015) + 0.3 * self._at(surface, rows, 0.02))
         color = np.array([0.040, 0.033, 0.027], np.float32) * tone[:, None]
-        return np.asarray(0.75 * color + 0.25 * np.minimum(base, 0.1), np.float32)
+        return np.asarray(0.5 * color + 0.7 * np.minimum(base, 0.15), np.float32)
 
     def _stone(self, surface: Surface, rows: Ints) -> Singles:
         shade = 0.10 + 0.05 * self._at(surface, rows, 0.03)

@@ -15,7 +15,7 @@ from mushpipe.sim.shapes import CapShape, Warp, draw_shape
 _TINTS = {
     "white": (0.83, 0.80, 0.735),
     "cream": (0.74, 0.63, 0.44),
-    "brown": (0.36, 0.245, 0.155),
+    "brown": (0.27, 0.178, 0.110),
 }
 _PRINTED = (0.80, 0.795, 0.765)
 _FLATNESS = 0.6  # a cap is about this much lower than wide; scales heights when caps collide
@@ -170,7 +170,7 @@ def _grow(
     if name == "mixed":
         name = ("white", "cream", "brown")[rng.integers(3)]
     tint = np.array(_PRINTED if kind == Kind.PRINTED else _TINTS[name])
-    tint = tint * rng.uniform(0.9, 1.03) * rng.normal(1, 0.006, 3)
+    tint = tint * rng.uniform(0.65 if name == "brown" else 0.9, 1.03) * rng.normal(1, 0.006, 3)
     scaly = rng.uniform(0.4, 1.0) if name == "brown" else rng.choice([0.0, 0.15], p=[0.8, 0.2])
     printed = kind == Kind.PRINTED
     return Mushroom(

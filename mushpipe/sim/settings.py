@@ -42,6 +42,7 @@ class SceneSettings(BaseModel):
     stumps: int = Field(1, ge=0, le=40, description="stems left by a cut, in view, about")
     fallen: int = Field(0, ge=0, le=40, description="caps lying on their side, in view, about")
     mycelium: float = Field(0.5, ge=0, le=1, description="white threads, patches and primordia")
+    soil: float = Field(1, ge=0.2, le=6, description="brightness of the soil; dry soil is 2 to 4")
     tray: bool = Field(False, description="show the rim of the tray at the left")
     table: Literal["wood", "cloth", "paint"] = Field("wood", description="table of the lab scene")
     clutter: int = Field(4, ge=0, le=20, description="papers, boxes and cups on the lab's table")

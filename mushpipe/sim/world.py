@@ -106,7 +106,7 @@ def make_world(settings: SceneSettings, travel: float = 0.0) -> World:
     wide = view.grown(0.16 * settings.distance + 0.01)
     texel = 0.75 * settings.pixel()
     if settings.scene == "bed":
-        base = grounds.soil(wide, texel, settings.mycelium, rng)
+        base = grounds.soil(wide, texel, settings.soil, settings.mycelium, rng)
     elif settings.scene == "lab":
         base = tables.table(settings.table, wide, texel, rng)
     else:
