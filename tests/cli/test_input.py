@@ -1,0 +1,77 @@
+"""What a run says about recordings that lack something."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mushpipe import Camera, Header, RgbdFrame
+from mushpipe.core.errors import EXIT_DAMAGED, EXIT_OK
+from mushpipe.core.recording import RecordingWriter
+from tests.cli.test_commands import GRAPH, mushpipe
+from tests.stages.scenes import discs
+
+CAMERA = Camera(160, 120, 200.0, 200.0, 79.5, 59.5)
+
+
+def record(path: Path, shapes: list[tuple[int, int]], depth: bool, camera: Camera | None) -> None:
+    writer = RecordingWriter(path, {})
+    gray = np.rint(255 * discs([(60.0, 60.0, 20.0)], 0.8, 0.2)).astype(np.uint8)
+    for i, (height, width) in enumerate(shapes):
+        color = np.repeat(gray[:height, :width, None], 3, axis=2)
+        native = np.full((height, width), 500, np.uint16) if depth else None
+        header = Header(10**9 + i * 33_000_000, i, "camera_color_optical_frame")
+        fits = camera if (height, width) == (120, 160) else None
+        writer.frame(RgbdFrame(header, color, native, 0.001, fits))
+    writer.close()
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "graph.yaml").write_text(GRAPH)
+    return tmp_path
+
+
+def test_depth_without_calibration_ends_the_run(folder: Path) -> None:
+    record(folder / "a.mcap", [(120, 160)], True, None)
+    done = mushpipe("run", "graph.yaml", "--source", "a.mcap", cwd=folder)
+    assert done.returncode == EXIT_DAMAGED
+    assert "WARNING: a.mcap has no calibration: nothing can be measured in metres" in done.stderr
+    assert (
+        "error: stage 'locate' (nearest-depth) failed on frame 0: depth cannot be turned into "
+        "metres without the camera's calibration: record camera_info, or set "
+        "source.camera: {fx: , fy: , cx: , cy: }"
+    ) in done.stderr
+
+
+def test_the_calibration_can_be_given(folder: Path) -> None:
+    record(folder / "a.mcap", [(120, 160)], True, None)
+    camera = "source.camera={fx: 200, fy: 200, cx: 79.5, cy: 59.5}"
+    done = mushpipe("run", "graph.yaml", "--source", "a.mcap", "--set", camera, cwd=folder)
+    assert done.returncode == EXIT_OK, done.stderr
+
+
+def test_colour_alone_runs_and_says_what_is_missing(folder: Path) -> None:
+    record(folder / "a.mcap", [(120, 160), (100, 160)], False, None)
+    done = mushpipe("run", "graph.yaml", "--source", "a.mcap", cwd=folder)
+    assert done.returncode == EXIT_OK, done.stderr
+    assert "a.mcap has no depth: positions, distances and diameters will be missing" in done.stderr
+    assert "the frame size changes from 160x120 to 160x100 at frame 1" in done.stderr
+    assert "2 of 2 picks have no position: there is no depth at them" in done.stderr
+
+
+def test_a_size_that_does_not_fit_the_calibration_ends_the_run(folder: Path) -> None:
+    record(folder / "a.mcap", [(120, 160), (100, 160)], True, CAMERA)
+    done = mushpipe("run", "graph.yaml", "--source", "a.mcap", cwd=folder)
+    assert done.returncode == EXIT_DAMAGED
+    assert "frame 1: the image is 160x100, its calibration is for 160x120" in done.stderr
+    assert "1 frames in = 1 processed" in done.stderr
+
+
+def test_an_empty_recording_is_incomplete(folder: Path) -> None:
+    RecordingWriter(folder / "a.mcap", {}).close()
+    done = mushpipe("run", "graph.yaml", "--source", "a.mcap", cwd=folder)
+    assert done.returncode == EXIT_DAMAGED
+    assert "it holds no colour images (it holds no topics at all)" in done.stderr
