@@ -130,13 +130,22 @@ def _describe_class(kind: Kind, name: str, plugin: type[Plugin]) -> str:
     lines = [f"{kind} {name}", "", inspect.getdoc(plugin) or "", ""]
     lines.append(f"inputs   {', '.join(inputs) or 'none'}")
     lines.append(f"outputs  {', '.join(outputs) or 'none'}")
-    rows = [
-        (key, _type(field), _default(field), field.get("description", ""))
-        for key, field in plugin.model_json_schema().get("properties", {}).items()
-    ]
+    rows = _settings(plugin.model_json_schema())
     if rows:
         lines += ["", *_columns([("setting", "type", "default", "meaning"), *rows], "")]
     return "\n".join(lines)
+
+
+def _settings(schema: dict[str, Any], prefix: str = "") -> list[tuple[str, ...]]:
+    """Return name, type, default and meaning per setting; a group's own settings follow it."""
+    rows: list[tuple[str, ...]] = []
+    for key, field in schema.get("properties", {}).items():
+        group = schema.get("$defs", {}).get(field.get("$ref", "").rpartition("/")[2])
+        default = "" if group else _default(field)
+        rows.append((prefix + key, _type(field), default, field.get("description", "")))
+        if group:
+            rows += _settings({**group, "$defs": schema["$defs"]}, f"{prefix}{key}.")
+    return rows
 
 
 _BOUNDS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
