@@ -2,10 +2,10 @@
 
     E(u) = 1/N [ sum_in |I - c1|^2 + sum_out |I - c2|^2 + mu Len(u) ]
 
-(Chan & Vese 2001, eq. 9, with lambda1 = lambda2 = 1, nu = 0), c1 and c2 the means inside and outside,
-N the number of pixels. Len is the Cauchy-Crofton length on the 8-neighbourhood (Boykov & Kolmogorov
-2003): pi/8 (n_h + n_v + (n_d1 + n_d2) / sqrt 2), n_* the number of unequal neighbours in a direction.
-With several channels the squared differences are averaged over them.
+(Chan & Vese 2001, eq. 9, with lambda1 = lambda2 = 1, nu = 0), c1 and c2 the means inside and
+outside, N the number of pixels. Len is the Cauchy-Crofton length on the 8-neighbourhood (Boykov &
+Kolmogorov 2003): pi/8 (n_h + n_v + (n_d1 + n_d2) / sqrt 2), n_* the number of unequal neighbours in
+a direction. With several channels the squared differences are averaged over them.
 """
 
 from __future__ import annotations

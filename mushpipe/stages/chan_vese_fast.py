@@ -1,7 +1,7 @@
 """Chan-Vese in milliseconds: a pyramid of convolution-thresholding, then descent on the contour.
 
 ICTM (Esedoglu & Tsai 2006; Wang et al. 2017) replaces the length by
-sqrt(2 pi) / sigma * sum u (1 - G_sigma * u); linearised, an iteration is one blur and one threshold:
+sqrt(2 pi) / sigma * sum u (1 - G_sigma * u); linearised, an iteration is a blur and a threshold:
 
     u <- 1 where (c1 - c2)(2 I - c1 - c2) - mu sqrt(2 pi) / sigma (1 - 2 G_sigma * u) > 0
 
@@ -38,7 +38,7 @@ def ictm_sweep(
     row = np.empty(width + 6, np.float32)
     changed = 0
     g0, g1, g2, g3 = taps[3], taps[4], taps[5], taps[6]
-    gain, offset, pull = np.float32(gain), np.float32(offset - pull), np.float32(2 * pull)
+    slope, level, bend = np.float32(gain), np.float32(offset - pull), np.float32(2 * pull)
     for y in range(height):
         a, b, c = max(y - 3, 0), max(y - 2, 0), max(y - 1, 0)
         d, e, f = min(y + 1, height - 1), min(y + 2, height - 1), min(y + 3, height - 1)
@@ -59,7 +59,7 @@ def ictm_sweep(
                 + g2 * (row[x + 1] + row[x + 5])
                 + g3 * (row[x] + row[x + 6])
             )
-            phi = gain * image[y, x] + offset + pull * blur
+            phi = slope * image[y, x] + level + bend * blur
             label = np.float32(1) if phi > 0 else np.float32(0)
             moved += abs(label - old[y, x])
             new[y, x] = label
@@ -93,14 +93,14 @@ def icm_sweep(image: Plane, u: Plane, gain: float, offset: float, mu: float) -> 
     """Flip, in raster order and in place, each pixel of the contour that lowers the energy by it.
 
     Label 1 where -(gain I + offset) + a (4 - 2 n4) + b (4 - 2 nd) < 0, with a = mu pi/8 and
-    b = a / sqrt 2, n4 and nd the set axial and diagonal neighbours; beyond the border there are none.
+    b = a / sqrt 2, n4 and nd the set axial and diagonal neighbours; there are none beyond the border.
 
     Returns the number of flips.
     """
     height, width = image.shape
     a = np.float32(mu * math.pi / 8)
     b = np.float32(mu * math.pi / 8 / math.sqrt(2))
-    gain, offset, one, two = np.float32(gain), np.float32(offset), np.float32(1), np.float32(2)
+    slope, level, one, two = np.float32(gain), np.float32(offset), np.float32(1), np.float32(2)
     column = np.empty(width + 2, np.float32)
     flips = 0
     for y in range(height):
@@ -117,11 +117,13 @@ def icm_sweep(image: Plane, u: Plane, gain: float, offset: float, mu: float) -> 
             west, east = np.float32(x > 0), np.float32(x < width - 1)
             axial = above * (one - two * u[up, x]) + below * (one - two * u[down, x])
             axial += west * (one - two * u[y, left]) + east * (one - two * u[y, right])
-            diagonal = above * (west * (one - two * u[up, left]) + east * (one - two * u[up, right]))
+            diagonal = above * (
+                west * (one - two * u[up, left]) + east * (one - two * u[up, right])
+            )
             diagonal += below * (
                 west * (one - two * u[down, left]) + east * (one - two * u[down, right])
             )
-            inside = a * axial + b * diagonal < gain * image[y, x] + offset
+            inside = a * axial + b * diagonal < slope * image[y, x] + level
             if inside != (u[y, x] > 0):
                 flips += 1
                 u[y, x] = np.float32(inside)

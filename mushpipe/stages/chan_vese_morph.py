@@ -8,6 +8,8 @@ Beyond the image there is background, as in scikit-image.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,14 +34,14 @@ def unpack(words: Words, width: int) -> NDArray[np.bool_]:
 
 
 @jit
-def _east(words: Words, y: int, k: int) -> np.uint64:
+def _east(words: Words, y: int, k: int) -> Any:
     """The word whose bits are the right neighbours; background beyond the image."""
     carry = words[y, k + 1] << np.uint64(63) if k + 1 < words.shape[1] else np.uint64(0)
     return (words[y, k] >> np.uint64(1)) | carry
 
 
 @jit
-def _west(words: Words, y: int, k: int) -> np.uint64:
+def _west(words: Words, y: int, k: int) -> Any:
     carry = words[y, k - 1] >> np.uint64(63) if k > 0 else np.uint64(0)
     return (words[y, k] << np.uint64(1)) | carry
 
