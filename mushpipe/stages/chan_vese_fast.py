@@ -75,16 +75,15 @@ def region_sums(image: Plane, u: Plane) -> tuple[int, float, float]:
     total = 0.0
     everything = 0.0
     for y in range(height):
-        count = np.float32(0)
-        sum_row = np.float32(0)
-        all_row = np.float32(0)
+        # Sums of one row in float32 keep the loop vectorised; a row is too short to lose digits.
+        count = sum_row = all_row = np.float32(0)
         for x in range(width):
             count += u[y, x]
             sum_row += u[y, x] * image[y, x]
             all_row += image[y, x]
         inside += int(count)
-        total += sum_row
-        everything += all_row
+        total += float(sum_row)
+        everything += float(all_row)
     return inside, total, everything
 
 
@@ -93,7 +92,7 @@ def icm_sweep(image: Plane, u: Plane, gain: float, offset: float, mu: float) -> 
     """Flip, in raster order and in place, each pixel of the contour that lowers the energy by it.
 
     Label 1 where -(gain I + offset) + a (4 - 2 n4) + b (4 - 2 nd) < 0, with a = mu pi/8 and
-    b = a / sqrt 2, n4 and nd the set axial and diagonal neighbours; there are none beyond the border.
+    b = a / sqrt 2, n4 and nd the set axial and diagonal neighbours; none lie beyond the border.
 
     Returns the number of flips.
     """
