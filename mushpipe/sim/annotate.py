@@ -1,0 +1,162 @@
+"""The truth of a view: what an evaluation may hold results against, exact from the geometry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from mushpipe.core.truth import Ignore, Instances, Truth
+from mushpipe.sim.mesh import Ints
+from mushpipe.sim.mushroom import Kind, Mushroom, turned_to
+from mushpipe.sim.noise import Floats
+from mushpipe.sim.raycast import rays
+from mushpipe.sim.render import Surface
+from mushpipe.sim.world import View, World
+
+MIN_VISIBLE = 0.5
+SMALLEST_PX = 8.0
+MIN_INSIDE = 0.7
+UPRIGHT_COSINE = 0.5  # an axis more than 60 degrees off the vertical is not upright
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """A closed convex outline: corners (K, 2), area, centroid (2,)."""
+
+    corners: Floats
+    area: float
+    center: Floats
+
+    @property
+    def radius(self) -> float:
+        """Radius of the circle with the same area."""
+        return float(np.sqrt(self.area / np.pi))
+
+    def extent(self) -> float:
+        """Return the largest distance of two corners."""
+        offset = self.corners[:, None] - self.corners
+        return float(np.sqrt((offset**2).sum(axis=-1).max()))
+
+    def share_inside(self, width: int, height: int) -> float:
+        """Return the share of its area that lies within an image."""
+        frame = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32) - 0.5
+        area, _ = cv2.intersectConvexConvex(self.corners.astype(np.float32), frame)
+        return float(min(area / self.area, 1.0))
+
+
+def outline_around(points: Floats) -> Outline:
+    """Return the convex hull of points (N, 2), area and centroid by the shoelace formula.
+
+    Caps are convex but for bumps of a few tenths of a per cent, so the hull of a cap's projected
+    vertices is its outline.
+    """
+    middle = points.mean(axis=0)
+    hull = cv2.convexHull((points - middle).astype(np.float32))[:, 0].astype(np.float64)
+    x, y = hull.T
+    following = np.roll(hull, -1, axis=0)
+    cross = x * following[:, 1] - y * following[:, 0]
+    area = cross.sum() / 2
+    center = ((hull + following) * cross[:, None]).sum(axis=0) / (6 * area)
+    return Outline(hull + middle, abs(float(area)), center + middle)
+
+
+def annotate(
+    world: World, view: View, surface: Surface, largest_px: float
+) -> tuple[Truth, Instances]:
+    """Return the truth of all mushrooms of which at least one pixel is seen.
+
+    Args:
+        world: The scene.
+        view: The camera.
+        surface: What it sees.
+        largest_px: Outlines with a larger radius are marked as too large.
+    """
+    owner = np.where(surface.outlined, surface.owner, -1)
+    seen = np.bincount(owner[owner >= 0], minlength=len(world.mushrooms))
+    numbers = np.flatnonzero(seen)
+    outlines = [outline_around(_projected(world, view, k)) for k in numbers.tolist()]
+    mushrooms = [world.mushrooms[k] for k in numbers]
+    centers = np.array([o.center for o in outlines]).reshape(-1, 2)
+    area = np.array([o.area for o in outlines])
+    visible = np.minimum(seen[numbers] / area, 1.0) if len(numbers) else area
+    across = [_across(world, k) for k in numbers.tolist()]
+    reasons = [
+        _reason(m, o, float(v), view, largest_px)
+        for m, o, v in zip(mushrooms, outlines, visible, strict=True)
+    ]
+    truth = Truth(
+        numbers,
+        centers,
+        np.array([o.radius for o in outlines]),
+        visible,
+        _apexes(world, view, numbers),
+        _surfaces(world, view, numbers, centers),
+        np.array([m.axis @ view.rotation for m in mushrooms]).reshape(-1, 3),
+        np.array([2 * o.radius for o in across]),
+        np.array([o.extent() for o in across]),
+        np.array(reasons, np.uint8),
+    )
+    rows = np.zeros(len(world.mushrooms) + 1, np.uint16)
+    rows[numbers] = 1 + np.arange(len(numbers))
+    return truth, Instances(rows[owner].reshape(surface.shape))
+
+
+def _projected(world: World, view: View, number: int) -> Floats:
+    points = view.seen(world.vertices[world.bodies[number]])
+    return view.camera.project(points)
+
+
+def _across(world: World, number: int) -> Outline:
+    """Return the outline seen along the axis from infinitely far, in m."""
+    mushroom = world.mushrooms[number]
+    frame = turned_to(mushroom.axis, 0.0)
+    points = world.vertices[world.bodies[number]] - mushroom.center
+    return outline_around(points @ frame[:, :2])
+
+
+def _reason(
+    mushroom: Mushroom, outline: Outline, visible: float, view: View, largest_px: float
+) -> Ignore:
+    """Return why a mushroom does not count; the first of several reasons."""
+    w, h = view.camera.width, view.camera.height
+    inside = (outline.center >= -0.5) & (outline.center < np.array([w, h]) - 0.5)
+    if mushroom.kind == Kind.STUMP:
+        return Ignore.CUT_STUMP
+    if mushroom.axis[2] < UPRIGHT_COSINE:
+        return Ignore.NOT_UPRIGHT
+    if not inside.all() or outline.share_inside(w, h) < MIN_INSIDE:
+        return Ignore.AT_BORDER
+    if outline.radius < SMALLEST_PX:
+        return Ignore.TOO_SMALL
+    if outline.radius > largest_px:
+        return Ignore.TOO_LARGE
+    return Ignore.HIDDEN if visible < MIN_VISIBLE else Ignore.COUNTS
+
+
+def _apexes(world: World, view: View, numbers: Ints) -> Floats:
+    """Return where each axis leaves its cap (N, 3) m, optical frame."""
+    center = np.array([world.mushrooms[k].center for k in numbers]).reshape(-1, 3)
+    axis = np.array([world.mushrooms[k].axis for k in numbers]).reshape(-1, 3)
+    length = np.array([2 * world.mushrooms[k].radius for k in numbers])[:, None]
+    start = center + length * axis
+    distance = _first_own(world, start, -axis, numbers)
+    return view.seen(start - distance[:, None] * axis)
+
+
+def _surfaces(world: World, view: View, numbers: Ints, centers: Floats) -> Floats:
+    """Return where the ray of each circle's centre meets its own cap (N, 3) m, optical frame."""
+    sight = view.camera.deproject(centers, np.ones(len(centers)))
+    start = np.broadcast_to(view.position, sight.shape)
+    distance = _first_own(world, start, sight @ view.rotation.T, numbers)
+    return np.asarray(sight * distance[:, None])
+
+
+def _first_own(world: World, start: Floats, direction: Floats, numbers: Ints) -> Floats:
+    """Return how far along ray i (N,) the outlined part of mushroom i begins; NaN if it misses."""
+    ray, distance, triangle = world.caster.every(rays(start, direction))
+    own = (world.owner[triangle] == numbers[ray]) & world.outlined[triangle]
+    first = np.full(len(numbers), np.inf)
+    np.minimum.at(first, ray[own], distance[own])
+    return np.where(np.isfinite(first), first, np.nan)

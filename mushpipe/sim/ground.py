@@ -1,0 +1,206 @@
+"""What mushrooms grow on: casing soil with clods, stones, mycelium and the rim of the tray."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from mushpipe.sim.mesh import Material, Mesh, box, height_field, revolve, sheet
+from mushpipe.sim.noise import Floats, Reals, Singles, blurred, mix, smoothstep
+from mushpipe.sim.planting import Area
+
+RIM_HEIGHT = 0.035
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A surface z = height(x, y) with its colour, on a grid of square texels.
+
+    Attributes:
+        area: What it covers; row 0 lies at y1.
+        texel: Size of a texel, m.
+        height: (H, W) m.
+        albedo: (H, W, 3) linear RGB.
+        material: How it is painted.
+    """
+
+    area: Area
+    texel: float
+    height: Singles
+    albedo: Singles
+    material: Material
+
+    def texels(self, points: Reals) -> tuple[Singles, Singles]:
+        """Return the column and row (N,) of points (N, 2) m."""
+        column = (points[:, 0] - self.area.x0) / self.texel
+        row = (self.area.y1 - points[:, 1]) / self.texel
+        return column.astype(np.float32), row.astype(np.float32)
+
+    def sample(self, layer: Singles, points: Reals) -> Singles:
+        """Interpolate a layer (H, W[, C]) at points (N, 2) m; the border goes on outside."""
+        column, row = self.texels(points)
+        # remap holds at most 32767 rows: fold the list of points into a table
+        width = max(1, min(4096, len(column)))
+        rest = -len(column) % width
+        x, y = (np.pad(axis, (0, rest)).reshape(-1, width) for axis in (column, row))
+        found = cv2.remap(layer, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(found.reshape(-1, *layer.shape[2:])[: len(column)])
+
+    def height_at(self, points: Reals) -> Floats:
+        """Return the height (N,) m at points (N, 2) m."""
+        return np.asarray(self.sample(self.height, points), np.float64)
+
+    def slopes(self) -> Singles:
+        """Return the gradient (H, W, 2) of the height along x and y."""
+        along_row, along_column = np.gradient(self.height, self.texel)
+        return np.stack([along_column, -along_row], axis=-1).astype(np.float32)
+
+    def mesh(self, step: float) -> Mesh:
+        """Return it as a mesh of about `step` m."""
+        h, w = self.height.shape
+        every = max(1, round(step / self.texel))
+        smooth = cv2.blur(self.height, (every, every)) if every > 1 else self.height
+        rows, columns = np.arange(0, h, every), np.arange(0, w, every)
+        x = self.area.x0 + columns * self.texel
+        y = self.area.y1 - rows * self.texel
+        return height_field(x, y, smooth[np.ix_(rows, columns)].astype(float), self.material)
+
+
+def grid_shape(area: Area, texel: float) -> tuple[int, int]:
+    """Return rows and columns of texels that cover an area."""
+    return (
+        int(np.ceil((area.y1 - area.y0) / texel)) + 1,
+        int(np.ceil((area.x1 - area.x0) / texel)) + 1,
+    )
+
+
+def soil(area: Area, texel: float, mycelium: float, rng: np.random.Generator) -> Ground:
+    """Return dark, crumbly casing soil, overgrown with mycelium to a share of 0..1."""
+    shape = grid_shape(area, texel)
+
+    def noise(grain: float) -> Singles:
+        return blurred(rng, shape, grain / texel)
+
+    crumbs = noise(0.0022)
+    height = 0.0035 * noise(0.03) + 0.0012 * noise(0.008)
+    height = height + 0.0011 * np.sqrt(np.maximum(crumbs, 0)) + 0.0003 * noise(0.0008)
+    tone = 0.30 * noise(0.0009) + 0.22 * noise(0.004) + 0.22 * noise(0.02) + 0.12 * crumbs
+    red = 0.06 * noise(0.006)
+    peat, clay = np.array([0.026, 0.022, 0.019]), np.array([0.021, 0.0225, 0.0245])
+    base = (peat + rng.uniform(0, 1) * (clay - peat)).astype(np.float32)
+    tilt = np.stack([1 + red, np.ones(shape), 1 - red], axis=-1)
+    albedo = (base * np.exp(tone)[..., None] * tilt).astype(np.float32)
+    _fibres(albedo, texel, area, rng)
+    cover = _mycelium(shape, texel, mycelium, area, rng)
+    white = np.array([0.50, 0.50, 0.48], np.float32)
+    albedo = mix(albedo.reshape(-1, 3), (*white,), cover.ravel()).reshape(albedo.shape)
+    height = height + 0.0007 * cover
+    return Ground(area, texel, height.astype(np.float32), albedo, Material.SOIL)
+
+
+def _fibres(albedo: Singles, texel: float, area: Area, rng: np.random.Generator) -> None:
+    """Draw bits of peat fibre and straw, and pale specks of lime."""
+    for _ in range(round(2500 * area.size)):
+        start = np.array([rng.uniform(0, albedo.shape[1]), rng.uniform(0, albedo.shape[0])])
+        turn, length = rng.uniform(0, np.pi), rng.uniform(0.002, 0.012) / texel
+        end = start + length * np.array([np.cos(turn), np.sin(turn)])
+        color = np.array([0.075, 0.052, 0.032]) * rng.uniform(0.4, 1.5)
+        ends = [tuple(int(v * 8) for v in p) for p in (start, end)]
+        cv2.line(albedo, ends[0], ends[1], color.tolist(), 1, cv2.LINE_AA, 3)
+    specks = area.draw(rng, round(1200 * area.size))
+    column = ((specks[:, 0] - area.x0) / texel).astype(int)
+    row = ((area.y1 - specks[:, 1]) / texel).astype(int)
+    albedo[row, column] = rng.uniform(0.1, 0.4, (len(specks), 1))
+
+
+def _mycelium(
+    shape: tuple[int, int], texel: float, amount: float, area: Area, rng: np.random.Generator
+) -> Singles:
+    """Return how white mycelium covers each texel: webbed patches and branching threads."""
+
+    def noise(grain: float) -> Singles:
+        return blurred(rng, shape, grain / texel)
+
+    patch = smoothstep(1.9 - 1.2 * amount, 3.0 - 1.2 * amount, noise(0.02) + 0.7 * noise(0.006))
+    web = np.exp(-((noise(0.001) / 0.3) ** 2)) + np.exp(-((noise(0.003) / 0.15) ** 2))
+    cover = patch * np.clip(0.10 + 0.40 * web + 0.30 * noise(0.0025) + 0.12 * noise(0.0008), 0, 1)
+    threads = np.zeros(shape, np.float32)
+    for _ in range(round(260 * amount * area.size)):
+        steps = np.cumsum(rng.normal(0, 0.35, 30)) + rng.uniform(0, 2 * np.pi)
+        path = np.cumsum(np.stack([np.cos(steps), np.sin(steps)], axis=-1), axis=0)
+        start = rng.uniform((0, 0), shape[::-1])
+        points = start + path * rng.uniform(0.0006, 0.0022) / texel
+        shade = float(rng.uniform(0.15, 0.6))
+        line = np.round(points * 8).astype(np.int32)[:, None]
+        cv2.polylines(threads, [line], False, shade, 1, cv2.LINE_AA, 3)
+    return np.asarray(np.clip(np.maximum(cover, threads), 0, 0.95), np.float32)
+
+
+def lump(rng: np.random.Generator, radius: float, rings: int, material: Material) -> Mesh:
+    """Return a knobbly ball around the origin."""
+    t = np.linspace(0, np.pi, rings)
+    ball = revolve(np.sin(t), np.cos(t), 2 * rings)
+    ball[[0, -1], :, :2] = 0
+    turns, phase = rng.normal(0, 2.2, (3, 3)), rng.uniform(0, 2 * np.pi, 3)
+    knobs = 1 + 0.16 * np.cos(ball @ turns + phase).sum(axis=-1, keepdims=True)
+    return sheet(ball * knobs * rng.uniform(0.7, 1.15, 3) * radius, material)
+
+
+def litter(ground: Ground, area: Area, density: float, rng: np.random.Generator) -> list[Mesh]:
+    """Scatter clods and stones over a ground.
+
+    Args:
+        ground: They lie on it, sunk in a little.
+        area: Where.
+        density: Pieces per m^2.
+        rng: Draws them.
+    """
+    count = round(density * area.size)
+    spots = area.draw(rng, count)
+    heights = ground.height_at(spots)
+    pieces = []
+    for spot, height in zip(spots, heights, strict=True):
+        radius = 0.0015 + 0.0065 * rng.beta(1, 4.5)
+        stone = rng.random() < 0.06
+        rings = 6 if radius < 0.003 else 9
+        piece = lump(rng, radius, rings, Material.STONE if stone else Material.CLOD)
+        position = np.array([*spot, height + radius * rng.uniform(-0.2, 0.5)])
+        pieces.append(piece.placed(np.eye(3), position))
+    return pieces
+
+
+def primordia(
+    ground: Ground, around: Floats, amount: float, area: Area, rng: np.random.Generator
+) -> list[Mesh]:
+    """Return clumps of white beads of 1 to 4 mm: mushrooms that have only begun.
+
+    Args:
+        ground: They sit on it.
+        around: (N, 2) m, places of mushrooms; half of the clumps keep near them.
+        amount: 0..1.
+        area: Where they may be.
+        rng: Draws them.
+    """
+    beads = []
+    for _ in range(round(600 * amount * area.size)):
+        spot = area.draw(rng, 1)[0]
+        if len(around) and rng.random() < 0.5:
+            spot = around[rng.integers(len(around))] + rng.normal(0, 0.014, 2)
+        number = 1 + int(rng.exponential(8))
+        spread = 0.0012 * np.sqrt(number)
+        places = spot + rng.normal(0, spread, (number, 2)) * rng.uniform(0.5, 1.6, 2)
+        for place, z in zip(places, ground.height_at(places), strict=True):
+            radius = float(np.clip(rng.gamma(2.0, 0.0006), 0.0004, 0.003))
+            bead = lump(rng, radius, 5 if radius < 0.0012 else 7, Material.MYCELIUM)
+            beads.append(bead.placed(np.eye(3), np.array([*place, z + 0.6 * radius])))
+    return beads
+
+
+def tray_rim(x: float, area: Area) -> list[Mesh]:
+    """Return the plank along the left side of a tray whose inner face is at x."""
+    length = area.y1 - area.y0
+    plank = box((0.016, length, 0.08), Material.METAL)
+    middle = (area.y0 + area.y1) / 2
+    return [plank.placed(np.eye(3), np.array([x - 0.008, middle, RIM_HEIGHT - 0.08]))]

@@ -1,0 +1,77 @@
+"""What a simulated scene is made of: settings with their units and bounds."""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from mushpipe import Camera
+
+FOCAL_PX = 617.0  # SR300 colour at 640x480, librealsense issue 10838
+
+
+class SceneSettings(BaseModel):
+    """The scene under the camera: what grows where, in which light."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    scene: Literal["bed", "lab", "plane"] = Field(
+        "bed", description="growing bed, printed mushrooms on a table, or a bare plane"
+    )
+    seed: int = Field(0, ge=0, description="seed of everything random")
+    width: int = Field(640, ge=64, le=1920, description="image width, px")
+    height: int = Field(480, ge=48, le=1440, description="image height, px")
+    distance: float = Field(0.5, ge=0.15, le=2, description="camera to bed, m")
+    camera_tilt_deg: float = Field(0, ge=0, le=20, description="camera off the vertical, degrees")
+    count: int = Field(80, ge=0, le=400, description="mushrooms in view, about")
+    cluster: float = Field(0.75, ge=0, le=1, description="0 spread out, 1 all in tight clusters")
+    size_mm: tuple[float, float] = Field(
+        (16, 58), description="smallest and largest cap diameter, mm (5 to 150)"
+    )
+    tilt_deg: tuple[float, float] = Field(
+        (0, 20), description="smallest and largest tilt of a cap off the vertical, degrees (0-45)"
+    )
+    shape_family: Literal["a", "b"] = Field(
+        "a", description="a: superellipse domes; b: Bezier domes, conical to flat-topped"
+    )
+    cap_color: Literal["white", "cream", "brown", "mixed"] = Field(
+        "white", description="colour of the caps"
+    )
+    pins: int = Field(40, ge=0, le=300, description="mushrooms too small to pick, in view, about")
+    stumps: int = Field(1, ge=0, le=40, description="stems left by a cut, in view, about")
+    fallen: int = Field(0, ge=0, le=40, description="caps lying on their side, in view, about")
+    mycelium: float = Field(0.5, ge=0, le=1, description="white threads, patches and primordia")
+    tray: bool = Field(False, description="show the rim of the tray at the left")
+    table: Literal["wood", "cloth", "paint"] = Field("wood", description="table of the lab scene")
+    clutter: int = Field(4, ge=0, le=20, description="papers, boxes and cups on the lab's table")
+    light: Literal["even", "gradient", "side", "spot", "harsh"] = Field(
+        "even",
+        description="soft from above, one side brighter, low lamp, bright centre, bare flash",
+    )
+    light_strength: float = Field(
+        1, ge=0, le=1, description="how far the light departs from even: 0 not at all"
+    )
+    largest_px: float = Field(
+        80, gt=8, description="caps of a larger outline are marked too large in the truth, px"
+    )
+
+    @model_validator(mode="after")
+    def _ranges(self) -> Self:
+        for name, low, high in (("size_mm", 5.0, 150.0), ("tilt_deg", 0.0, 45.0)):
+            first, last = getattr(self, name)
+            if not low <= first <= last <= high:
+                raise ValueError(
+                    f"{name} is {first}, {last}: expected {low} <= first <= last <= {high}"
+                )
+        return self
+
+    def camera(self) -> Camera:
+        """Return the camera: a pinhole with the SR300's colour field of view."""
+        focal = FOCAL_PX * self.width / 640
+        center = (self.width - 1) / 2, (self.height - 1) / 2
+        return Camera(self.width, self.height, focal, focal, *center)
+
+    def pixel(self) -> float:
+        """Return the size of a pixel on the bed, m."""
+        return self.distance / self.camera().fx
