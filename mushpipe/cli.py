@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mushpipe.evaluate.cli import register as register_eval
+
 if TYPE_CHECKING:
     from mushpipe.core.plan import Plan
 
@@ -250,6 +252,9 @@ def plugins_describe(
     from mushpipe.info import describe_plugin
 
     _out(describe_plugin(load_registry(), name))
+
+
+register_eval(app)
 
 
 def main() -> None:

@@ -24,6 +24,12 @@ _VECTORS = {
     "axis": ("axis_x", "axis_y", "axis_z"),
 }
 
+_HEADING = [
+    *("stamp_ns", "sequence", "frame_id", "id", "u", "v", "radius_px"),
+    *(*_VECTORS["position_m"], "distance_m", "diameter_m", *_VECTORS["quaternion_xyzw"]),
+    *(*_VECTORS["axis"], "score", "sigma_tilt_rad", "depth_source", "flags"),
+]
+
 
 def read_picks(path: Path, topic: str | None = None) -> Iterator[tuple[Header, Picks]]:
     """Yield the picks of a result recording, frame by frame.
@@ -95,7 +101,7 @@ def ndjson_lines(path: Path, topic: str | None = None) -> Iterator[str]:
 
 def csv_lines(path: Path, topic: str | None = None) -> Iterator[str]:
     """Yield a heading and one line per pick; an empty field is unknown."""
-    heading = True
+    yield _csv(_HEADING)
     for header, picks in read_picks(path, topic):
         for row in pick_rows(picks):
             flat = {
@@ -104,10 +110,7 @@ def csv_lines(path: Path, topic: str | None = None) -> Iterator[str]:
                 "frame_id": header.frame_id,
                 **_flat(row),
             }
-            if heading:
-                yield _csv(list(flat))
-                heading = False
-            yield _csv(list(flat.values()))
+            yield _csv([flat[name] for name in _HEADING])
 
 
 def _flat(row: dict[str, Any]) -> dict[str, Any]:

@@ -22,7 +22,8 @@ def write_capsule(folder: Path, plan: Plan, node: Node, frame: RgbdFrame, messag
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"failure-{node.name}-{frame.header.sequence}.mcap"
-    kept = replace(plan, sinks=tuple(sink for sink in plan.sinks if sink.name == node.name))
+    sinks = tuple(sink for sink in plan.sinks if sink.name == node.name)
+    kept = replace(plan, sinks=sinks, on_error="fail")  # one frame: skipping it would show nothing
     metadata = {GRAPH: {"json": json.dumps(kept.resolved()), "failure": message}}
     writer = RecordingWriter(path, metadata)
     writer.frame(frame)

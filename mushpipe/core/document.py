@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,10 +15,19 @@ from mushpipe.core.errors import GraphError, Problem
 Location = tuple[str | int, ...]
 MAX_NODES = 20_000
 MAX_DEPTH = 50
-# What PyYAML raises on text that is no YAML: an escape like "\\UFFFFFFFF" is an OverflowError.
+# What PyYAML raises on text that is no YAML: an escape like "\UFFFFFFFF" is an OverflowError.
 _UNREADABLE = (yaml.YAMLError, RecursionError, ValueError, OverflowError)
 _COLLECTIONS = {"map", "seq"}
 _SCALARS = {"null", "bool", "int", "float", "str", "timestamp"}
+
+
+class _Loader(yaml.SafeLoader):
+    """Reads 1e-3 as a number, as YAML 1.2 and people do; YAML 1.1 wants 1.0e-3."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+$"), list("-+0123456789")
+)
 
 
 @dataclass
@@ -72,7 +82,7 @@ def parse_document(text: str, file: str, base: Path) -> Document:
     """Parse YAML text; see `read_document`."""
     document = Document(file, base, lines=text.splitlines())
     try:
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
+        root = yaml.compose(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line, column = (mark.line + 1, mark.column + 1) if mark else (0, 0)
@@ -99,7 +109,7 @@ def parse_value(text: str, label: str) -> Any:
         GraphError: It is YAML, but not plain data; the label says where it comes from.
     """
     try:
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
+        root = yaml.compose(text, Loader=_Loader)
     except _UNREADABLE:
         return text
     builder = _Builder(Document(label, Path()))

@@ -19,7 +19,7 @@ READ_AHEAD = 2
 SINK_QUEUE = 4
 
 
-def failure(node: Node, sequence: int | None, error: Exception) -> StageError:
+def failure(node: Node, sequence: int | None, error: BaseException) -> StageError:
     """Say which plugin failed on which frame, keeping the exit code of a known error."""
     at = "" if sequence is None else f" on frame {sequence}"
     known = isinstance(error, MushpipeError)
@@ -55,19 +55,25 @@ class SourceThread(threading.Thread):
 
     def run(self) -> None:
         """Hand over frames until the source ends, fails, or the run stops."""
+        try:
+            self._read()
+        except MushpipeError as error:
+            self.error = error
+        except (Exception, SystemExit) as error:
+            self.error = failure(self.node, None, error)
+        finally:
+            self.box.close()
+
+    def _read(self) -> None:
         speed = self.source.speed if isinstance(self.source, ReplaySource) else 0.0
         frames = self.source.frames()
         try:
             for frame in islice(paced(frames, speed, self.stop), self.source.max_frames):
                 if self.stop.is_set() or not self.box.put(frame):
                     break
-        except MushpipeError as error:
-            self.error = error
-        except Exception as error:
-            self.error = failure(self.node, None, error)
         finally:
-            frames.close() if hasattr(frames, "close") else None
-            self.box.close()
+            if hasattr(frames, "close"):
+                frames.close()
 
 
 class SinkThread(threading.Thread):
@@ -94,7 +100,7 @@ class SinkThread(threading.Thread):
                 consume(**inputs)
                 self.consumed += 1
                 in_a_row = 0
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 self.failed += 1
                 in_a_row += 1
                 if in_a_row >= self.tolerant:

@@ -61,40 +61,51 @@ def compile_document(
     for item in overrides:
         text, label = (item, "") if isinstance(item, str) else item
         problems += apply_override(document, text, label)
-    try:
-        graph = GraphFile.model_validate_json(json.dumps(document.data), strict=True)
-    except ValidationError as error:
-        raise GraphError(
-            [*problems, *_translate(document, (), error, list(GraphFile.model_fields))]
-        ) from error
-    problems += _check_names(document, graph)
+    head, entries = _head(document, problems), _entries(document)
+    problems += _check_names(document, entries)
     nodes = {
-        kind: [_node(document, registry, kind, at, settings, problems) for at, settings in entries]
-        for kind, entries in _entries(graph).items()
+        kind: [_node(document, registry, kind, at, entry, problems) for at, entry in group]
+        for kind, group in entries.items()
     }
     complete = [node for group in nodes.values() for node in group if node is not None]
-    if len(complete) == sum(map(len, nodes.values())):
+    if nodes["source"] and len(complete) == sum(map(len, nodes.values())):
         problems += wire(document, registry, complete)
-    if problems:
+    if problems or head is None:
         raise GraphError(problems)
     return Plan(
         file=document.file,
         source=complete[0],
         stages=tuple(node for node in complete if node.kind == "stage"),
         sinks=tuple(node for node in complete if node.kind == "sink"),
-        seed=graph.seed,
-        on_error=graph.on_error,
-        max_failures=graph.max_failures,
+        seed=head.seed,
+        on_error=head.on_error,
+        max_failures=head.max_failures,
         overrides=tuple(document.overrides.values()),
         warnings=tuple(document.warnings),
     )
 
 
-def _entries(graph: GraphFile) -> dict[Kind, list[tuple[Location, dict[str, Any]]]]:
+def _head(document: Document, problems: list[Problem]) -> GraphFile | None:
+    try:
+        return GraphFile.model_validate_json(json.dumps(document.data), strict=True)
+    except ValidationError as error:
+        problems += _translate(document, (), error, list(GraphFile.model_fields))
+        return None
+
+
+def _entries(document: Document) -> dict[Kind, list[tuple[Location, dict[str, Any]]]]:
+    """Return what the file says of each plugin, as far as it is in a shape to be checked."""
+
+    def named(key: str) -> list[tuple[Location, dict[str, Any]]]:
+        section = document.data.get(key)
+        items = section.items() if isinstance(section, dict) else ()
+        return [((key, name), entry) for name, entry in items if isinstance(entry, dict)]
+
+    source = document.data.get("source")
     return {
-        "source": [(("source",), graph.source)],
-        "stage": [(("stages", name), settings) for name, settings in graph.stages.items()],
-        "sink": [(("sinks", name), settings) for name, settings in graph.sinks.items()],
+        "source": [(("source",), source)] if isinstance(source, dict) else [],
+        "stage": named("stages"),
+        "sink": named("sinks"),
     }
 
 
@@ -112,19 +123,21 @@ def _replace_source(document: Document, source: str, registry: Registry) -> None
             document.overrides[("source", key)] = label
 
 
-def _check_names(document: Document, graph: GraphFile) -> list[Problem]:
+def _check_names(
+    document: Document, entries: dict[Kind, list[tuple[Location, dict[str, Any]]]]
+) -> list[Problem]:
     problems = []
-    for section, names in (("stages", graph.stages), ("sinks", graph.sinks)):
-        for name in names:
-            message = ""
-            if not _NAME.fullmatch(name):
-                message = f"'{name}' is no name: letters, digits, - and _, beginning with a letter"
-            elif name in GraphFile.model_fields:
-                message = f"'{name}' is a key of the graph file and cannot name a stage or sink"
-            elif section == "sinks" and name in graph.stages:
-                message = f"a stage is called '{name}' already"
-            if message:
-                problems.append(document.problem((section, name), message, key=True))
+    stages = {str(at[-1]) for at, _ in entries["stage"]}
+    for at, _ in (*entries["stage"], *entries["sink"]):
+        name, message = str(at[-1]), ""
+        if not _NAME.fullmatch(name):
+            message = f"'{name}' is no name: letters, digits, - and _, beginning with a letter"
+        elif name in GraphFile.model_fields:
+            message = f"'{name}' is a key of the graph file and cannot name a stage or sink"
+        elif at[0] == "sinks" and name in stages:
+            message = f"a stage is called '{name}' already"
+        if message:
+            problems.append(document.problem(at, message, key=True))
     return problems
 
 

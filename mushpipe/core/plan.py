@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
@@ -56,7 +57,9 @@ class Plan:
         """Return a plan whose plugins have no state yet."""
 
         def copy(node: Node) -> Node:
-            return replace(node, plugin=node.plugin.model_copy(deep=True))
+            # Built anew, not deep-copied: state may hold what cannot be copied, a lock say.
+            kind, settings = type(node.plugin), deepcopy(dict(node.plugin))
+            return replace(node, plugin=kind.model_construct(set(settings), **settings))
 
         return replace(
             self,

@@ -51,12 +51,12 @@ class Entry:
             PluginError: It cannot be imported, or is of another kind.
             DependencyError: It needs a library that this system lacks.
         """
-        where = f"{self.kind} '{self.name}' of {self.distribution} {self.version}"
+        where = f"{self.kind} '{self.name}' of {self.distribution} {self.version}".strip()
         try:
             plugin = _import(self.target) if isinstance(self.target, str) else self.target
         except DependencyError:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise PluginError(f"{where} cannot be imported: {_brief(error)}") from error
         if kind_of(plugin) != self.kind:
             raise PluginError(f"{where} is a {kind_of(plugin)}, not a {self.kind}")
@@ -153,7 +153,7 @@ def load_registry() -> Registry:
     found = sorted(entry_points(group=GROUP), key=lambda e: (_owner(e)[0] != GROUP, _owner(e)))
     wanted = os.environ.get("MUSHPIPE_PLUGINS")
     if wanted is not None:
-        keep = {GROUP, *wanted.split(",")}
+        keep = {GROUP, *map(str.strip, wanted.split(","))}
         found = [point for point in found if _owner(point)[0] in keep]
     register(registry, found)
     return registry
@@ -166,6 +166,7 @@ def register(registry: Registry, points: Iterable[EntryPoint]) -> None:
     for point in points:
         distribution, version = registry._owner = _owner(point)
         before = sum(map(len, registry.entries.values()))
+        module = None
         try:
             module = point.load()
             manager.register(module)
@@ -174,12 +175,12 @@ def register(registry: Registry, points: Iterable[EntryPoint]) -> None:
             manager.subset_hook_caller("mushpipe_register", others)(registry=registry)
             if sum(map(len, registry.entries.values())) == before:
                 raise PluginError("it registers nothing: is @mushpipe.hookimpl missing?")
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             registry.broken.append(
                 Broken(point.name, distribution, version, _brief(error), traceback.format_exc())
             )
-            if manager.has_plugin(point.value):
-                manager.unregister(name=point.value)
+            if module is not None and manager.is_registered(module):
+                manager.unregister(module)  # else its fault would be found again with the next one
 
 
 def _owner(point: EntryPoint) -> tuple[str, str]:
@@ -221,7 +222,7 @@ def _module_of_file(path: Path) -> ModuleType:
     sys.modules[module_name] = module
     try:
         cast(Loader, cast(ModuleSpec, spec).loader).exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         del sys.modules[module_name]
         raise PluginError(f"{path} cannot be imported: {_brief(error)}") from error
     return module

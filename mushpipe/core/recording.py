@@ -14,7 +14,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 from mcap.exceptions import InvalidMagic, McapError
 from mcap.reader import SeekingReader
-from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schema, Statistics
+from mcap.records import Attachment, Channel, Chunk, DataEnd, McapRecord, Metadata, Schema
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
@@ -28,7 +28,7 @@ from mushpipe.core.types import Header, RgbdFrame
 # What mcap's reader raises on bytes that are not what they claim to be.
 _GARBAGE = (
     *(McapError, ValueError, struct.error, ZstdError, RuntimeError, MemoryError, TypeError),
-    *(OverflowError, LookupError),
+    *(OverflowError, LookupError, OSError),
 )
 # opcode, length, start of the summary, start of its offsets, CRC of all from that start to here
 _FOOTER = struct.Struct("<BQQQI")
@@ -65,7 +65,7 @@ class Index:
 
 
 class RecordingReader:
-    """Reads an MCAP file from front to back, chunk by chunk, checking every CRC.
+    """Reads an MCAP file from front to back, chunk by chunk, checking the CRC of each.
 
     Messages come in file order, sorted by log time within a chunk. ``damage`` says afterwards,
     in words, what could not be read.
@@ -125,8 +125,13 @@ class RecordingReader:
         with self.path.open("rb") as file:
             limit = self.path.stat().st_size
             reader = StreamReader(file, emit_chunks=True, record_size_limit=limit)
+            in_summary = False
             try:
                 for record in reader.records:
+                    # What the summary repeats was read already; it goes on to the last byte.
+                    in_summary |= isinstance(record, DataEnd)
+                    if in_summary:
+                        continue
                     if not isinstance(record, Chunk):
                         yield record
                     elif wanted(record):
@@ -176,9 +181,10 @@ class RecordingReader:
     def _index_from_summary(self) -> Index:
         with self.path.open("rb") as file:
             self._check_summary(file)
+            file.seek(0)
             reader = SeekingReader(file, record_size_limit=self.path.stat().st_size)
             summary = reader.get_summary()
-            if summary is None or not isinstance(summary.statistics, Statistics):
+            if summary is None or summary.statistics is None:
                 raise ValueError("no summary")
             counts: Counter[str] = Counter()
             for channel_id, count in summary.statistics.channel_message_counts.items():

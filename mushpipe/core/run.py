@@ -16,7 +16,7 @@ import numpy as np
 
 from mushpipe.core.capsule import write_capsule
 from mushpipe.core.edges import SinkThread, SourceThread, failure
-from mushpipe.core.errors import MushpipeError, StageError
+from mushpipe.core.errors import MushpipeError, StageError, UsageError
 from mushpipe.core.manifest import build_manifest
 from mushpipe.core.plan import Link, Node, Plan
 from mushpipe.core.report import Durations, RunReport
@@ -46,13 +46,11 @@ def run(
         The report; a failure is in its ``error``, never raised.
     """
     runner = _Runner(plan.fresh(), stop or threading.Event(), progress, capsules)
-    started = time.monotonic()
     try:
         runner.run()
     except MushpipeError as error:
         runner.report.error = error
-    runner.report.elapsed_s = time.monotonic() - started
-    runner.report.interrupted = runner.interrupted
+    runner.report.elapsed_s = time.monotonic() - runner.started
     return runner.report
 
 
@@ -67,13 +65,16 @@ class _Runner:
         self.report = RunReport(durations={node.name: Durations() for node in plan.stages})
         on_error = plan.on_error or ("fail" if plan.replay() else "skip")
         self.tolerance = plan.max_failures if on_error == "skip" else 1
-        self.interrupted = False
+        self.started = time.monotonic()
+        self.saved: set[str] = set()  # nodes with a failure capsule
 
     def run(self) -> None:
         source = self.plan.source.plugin
         if not isinstance(source, Source):
             raise TypeError("the plan's source is not a Source")
-        info = RunInfo(source.name(), build_manifest(self.plan))
+        with _named(self.plan.source):
+            info = RunInfo(source.name(), build_manifest(self.plan))
+            self._spare_the_recording(source, info)
         with ExitStack() as stack:
             stack.enter_context(_opened(self.plan.source, _opener(self.plan.source)))
             for node in self.plan.stages:
@@ -84,13 +85,33 @@ class _Runner:
             reader = SourceThread(self.plan.source, source, threading.Event())
             try:
                 self._loop(reader, threads)
+            except StageError as error:
+                self.report.error = error
             finally:
                 self._wind_up(reader, source, threads)
-            for thread in threads:
-                plugin = thread.node.plugin
-                if isinstance(plugin, Sink) and thread.error is None:
-                    with _named(thread.node):
-                        plugin.finish(self.report.summary())
+            self._finish(threads)
+
+    def _spare_the_recording(self, source: Source, info: RunInfo) -> None:
+        """Raise UsageError where a sink would write over the recording that is played."""
+        played = {path.resolve() for path in source.files()}
+        for node in self.plan.sinks:
+            files = node.plugin.files(info) if isinstance(node.plugin, Sink) else ()
+            for path in files:
+                if path.resolve() in played:
+                    raise UsageError(f"sink '{node.name}' would write over its own source {path}")
+
+    def _finish(self, threads: list[SinkThread]) -> None:
+        """Tell the sinks how the run went; the first error of the run stays the one reported."""
+        for thread in threads:
+            plugin = thread.node.plugin
+            if not isinstance(plugin, Sink) or thread.error is not None:
+                continue
+            try:
+                plugin.finish(self.report.summary())
+            except Exception as error:
+                failed = failure(thread.node, None, error)
+                self.report.error = self.report.error or failed
+                logger.warning("%s", failed)
 
     def _sink_thread(self, node: Node) -> SinkThread:
         return SinkThread(node, self.plan.delivery(node) == "latest", self.tolerance)
@@ -101,7 +122,7 @@ class _Runner:
         failures_in_a_row = 0
         while not reader.box.finished and not any(thread.error for thread in threads):
             if self.stop.is_set():
-                self.interrupted = True
+                self.report.interrupted = True
                 return
             frame = reader.box.get(timeout=0.1)
             if frame is None:
@@ -138,14 +159,15 @@ class _Runner:
         self.report.read = reader.box.accepted
         self.report.dropped = reader.box.dropped
         self.report.waiting = reader.box.waiting
+        self.report.elapsed_s = time.monotonic() - self.started
         self.report.source = source.counts()
-        self.report.error = reader.error
         for thread in threads:
             self.report.sinks[thread.node.name] = thread.report()
             if thread.error is not None:
-                self.report.error = thread.error
+                self.report.error = self.report.error or thread.error
                 if thread.failed_frame is not None:
                     self._save_capsule(thread.node, thread.failed_frame, thread.error)
+        self.report.error = self.report.error or reader.error
 
     def _process(self, frame: RgbdFrame) -> Trace:
         seen = replace(frame, attached={})
@@ -175,16 +197,17 @@ class _Runner:
             )
         result = node.plugin.process(**arguments)  # type: ignore[attr-defined]
         values = result if isinstance(result, tuple) else (result,)
-        _check_outputs(node, values, frame)
+        seen = [value for value in arguments.values() if isinstance(value, RgbdFrame)]
+        _check_outputs(node, values, seen[0] if seen else frame)
         return values
 
     def _save_capsule(self, node: Node, frame: RgbdFrame, error: Exception) -> None:
-        done = any(f"failure-{node.name}-" in path for path in self.report.capsules)
-        if self.capsules is None or done:
+        if self.capsules is None or node.name in self.saved:
             return
+        self.saved.add(node.name)
         try:
             path = write_capsule(self.capsules, self.plan, node, frame, str(error))
-        except OSError as trouble:
+        except Exception as trouble:  # the failure of the stage is the one to report
             logger.warning("the failing frame could not be saved: %s", trouble)
         else:
             self.report.capsules.append(str(path))
@@ -235,6 +258,7 @@ def _sink_inputs(node: Node, trace: Trace) -> dict[str, Any]:
 
 
 def _check_outputs(node: Node, values: tuple[Any, ...], frame: RgbdFrame) -> None:
+    """Raise TypeError or ValueError where outputs are not as declared, or do not fit the frame."""
     expected = node.ports.outputs
     matches = len(values) == len(expected) and all(map(isinstance, values, expected))
     if not matches:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from mushpipe.core.errors import PluginError
+from mushpipe.core.errors import MushpipeError
 from mushpipe.core.graph import GraphFile
 from mushpipe.core.plugins import Registry
 from mushpipe.core.stage import Kind
@@ -19,7 +19,11 @@ def graph_schema(registry: Registry) -> dict[str, Any]:
     for key, kind in (("stages", "stage"), ("sinks", "sink")):
         choice = _one_of(registry, kind, definitions)  # type: ignore[arg-type]
         properties[key]["additionalProperties"] = choice
-    return {**schema, "$schema": "http://json-schema.org/draft-07/schema#", "$defs": definitions}
+    return {
+        **schema,
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "$defs": definitions,
+    }
 
 
 def _one_of(registry: Registry, kind: Kind, definitions: dict[str, Any]) -> dict[str, Any]:
@@ -28,7 +32,7 @@ def _one_of(registry: Registry, kind: Kind, definitions: dict[str, Any]) -> dict
     for name in registry.names(kind):
         try:
             plugin = registry.entries[kind, name][0].load()
-        except PluginError:
+        except MushpipeError:
             continue
         names.append(name)
         own = plugin.model_json_schema(ref_template=f"#/$defs/{kind}.{name}.{{model}}")

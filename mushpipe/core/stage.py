@@ -170,7 +170,7 @@ def ports_of(plugin: type[Plugin]) -> Ports:
         raise PluginError(f"{plugin.__qualname__} has no method '{name}'")
     try:
         hints = typing.get_type_hints(method)
-    except NameError as error:
+    except Exception as error:  # an annotation in quotes can be any code
         raise PluginError(f"{plugin.__qualname__}.{name}: unknown annotation: {error}") from error
     inputs, wants_rng = [], False
     for parameter in list(signature(method).parameters.values())[1:]:

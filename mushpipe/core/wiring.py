@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from mushpipe.core.document import Document
-from mushpipe.core.errors import PluginError, Problem, suggest
+from mushpipe.core.document import Document, Location
+from mushpipe.core.errors import MushpipeError, Problem, suggest
 from mushpipe.core.plan import Link, Node
 from mushpipe.core.plugins import Registry
 from mushpipe.core.stage import Port, ports_of
@@ -20,7 +20,7 @@ def wire(document: Document, registry: Registry, nodes: list[Node]) -> list[Prob
         above = [other for other in nodes[:position] if other.kind != "sink"]
         unknown = node.asked.keys() - {port.name for port in node.ports.inputs}
         for name in sorted(unknown):
-            at = (f"{node.kind}s", node.name, "inputs", name)
+            at = (*_place(node), "inputs", name)
             hint = suggest(name, [port.name for port in node.ports.inputs])
             problems.append(document.problem(at, f"'{node.use}' has no input '{name}'", hint, True))
         for port in node.ports.inputs:
@@ -48,7 +48,7 @@ def _connect(
                 if issubclass(produced, port.type):
                     node.links[port.name] = Link(other.name, index)
                     return None
-    at = (f"{node.kind}s", node.name)
+    at = _place(node)
     if wanted is not None:
         message = _why_not(node, port, wanted, above, nodes)
         return document.problem((*at, "inputs", port.name), message)
@@ -56,6 +56,10 @@ def _connect(
         return None
     message = f"nothing above '{node.name}' produces the {port.type.__name__} of its '{port.name}'"
     return document.problem(at, message, _who_produces(registry, port), key=True)
+
+
+def _place(node: Node) -> Location:
+    return ("source",) if node.kind == "source" else (f"{node.kind}s", node.name)
 
 
 def _why_not(node: Node, port: Port, wanted: str, above: list[Node], nodes: list[Node]) -> str:
@@ -94,7 +98,7 @@ def _who_produces(registry: Registry, port: Port) -> str:
         for entry in registry.entries["stage", name]:
             try:
                 outputs = ports_of(entry.load()).outputs
-            except PluginError:
+            except MushpipeError:
                 continue
             able += [name] if any(issubclass(t, port.type) for t in outputs) else []
     return f"stages that produce {port.type.__name__}: {', '.join(able) or 'none installed'}"

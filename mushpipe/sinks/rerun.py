@@ -59,7 +59,7 @@ class RerunSink(Sink):
 
         rec = self._recording
         rec.set_time("frame", sequence=frame.header.sequence)
-        rec.set_time("capture", timestamp=frame.header.stamp_ns / 1e9)
+        rec.set_time("capture", timestamp=np.datetime64(frame.header.stamp_ns, "ns"))
         self._log_frame(frame)
         if mask is not None:
             rec.log(f"{_IMAGE}/mask", rr.SegmentationImage(mask.foreground.astype(np.uint8)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -107,7 +107,7 @@ class McapSource(ReplaySource):
         yield from self._passes(_Player(self, reader, index, topics, self._counts), reader)
 
     def _passes(self, player: _Player, reader: RecordingReader) -> Iterator[RgbdFrame]:
-        delivered, shift_ns, turn = 0, 0, 0
+        delivered = turn = shift = shift_ns = 0
         while turn < self.loop or self.loop == 0:
             first = last = None
             for frame in player.play():
@@ -118,14 +118,15 @@ class McapSource(ReplaySource):
                         header,
                         stamp_ns=header.stamp_ns + shift_ns,
                         arrival_ns=header.arrival_ns + shift_ns,
-                        sequence=delivered,
+                        sequence=header.sequence + shift,
                     )
                 yield replace(frame, header=header)
                 delivered += 1
             if first is None or last is None or reader.damage or player.error:
                 break
             turn += 1
-            # Time goes on in the next turn, one average frame after the last one.
+            # Numbers and time go on in the next turn, one average frame after the last one.
+            shift += last.sequence - first.sequence + 1
             span = last.stamp_ns - first.stamp_ns
             shift_ns += span + span // max(1, player.frames - 1) if span else 33_333_333
         damage = [*reader.damage, *([player.error] if player.error else [])]
@@ -161,7 +162,7 @@ class _Player:
         self.frames = 0
         self.size: tuple[int, ...] | None = None
         self._factories = (ProtobufDecoders(), Ros2Decoders())
-        self.camera: Camera | None = self._first_camera()
+        self.first_camera = self.camera = self._first_camera()
         if topics.depth is None:
             logger.warning(NO_DEPTH, settings.path.name)
         if self.camera is None and settings.camera is None:
@@ -172,9 +173,10 @@ class _Player:
         pairing: Pairing[_Color, _Depth] = Pairing(tolerance_ns)
         wanted = {t for t in vars(self.topics).values() if t is not None}
         self.frames = 0
+        self.camera = self.first_camera
         for raw in self.reader.messages(wanted, self.start_ns, self.end_ns):
             if raw.channel.topic == self.topics.camera:
-                self.camera = self._decode(raw, _calibration) or self.camera
+                self.camera = self._decode(raw, _calibration, "calibrations") or self.camera
             elif raw.channel.topic == self.topics.depth:
                 depth = self._decode(raw, self._depth)
                 if depth:
@@ -190,14 +192,19 @@ class _Player:
         self.counts["depth images without colour"] += pairing.depth_alone
 
     def _first_camera(self) -> Camera | None:
+        """Return the calibration in force at the start, which may be recorded after it."""
         if self.topics.camera is None:
             return None
-        for raw in self.reader.messages({self.topics.camera}):
-            return self._decode(raw, _calibration)
-        return None
+        topic = {self.topics.camera}
+        before = self.reader.messages(topic, 0, self.start_ns + 1) if self.start_ns else ()
+        first = next(iter(deque(before, maxlen=1)), None)
+        first = first or next(self.reader.messages(topic), None)
+        return self._decode(first, _calibration, "") if first else None
 
-    def _decode(self, raw: Raw, decode: Callable[[Any, Raw], T | None]) -> T | None:
-        """Decode a message, or count it as undecodable and return None."""
+    def _decode(
+        self, raw: Raw, decode: Callable[[Any, Raw], T | None], what: str = "images"
+    ) -> T | None:
+        """Decode a message, or return None and count it where ``what`` says as what."""
         try:
             for factory in self._factories:
                 decoder = factory.decoder_for(raw.channel.message_encoding, raw.schema)
@@ -205,7 +212,8 @@ class _Player:
                     return decode(decoder(raw.message.data), raw)
             raise ValueError(f"message encoding '{raw.channel.message_encoding}' is not supported")
         except Exception as error:  # whatever a decoder makes of foreign bytes
-            self.counts["images that could not be decoded"] += 1
+            if what:
+                self.counts[f"{what} that could not be decoded"] += 1
             self.error = self.error or f"{raw.channel.topic}: {error}"
             return None
 

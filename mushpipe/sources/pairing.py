@@ -13,8 +13,8 @@ D = TypeVar("D")
 class Pairing(Generic[C, D]):
     """Pairs two streams of stamped items within a tolerance; every colour item comes out once.
 
-    Stamps must rise within each stream. A colour item waits until its depth item came, a later
-    depth item shows that none will, or `PATIENCE` further colour items have arrived.
+    Stamps must rise within each stream. A colour item waits until its depth item came, later
+    items show that none will, or `PATIENCE` further items of a kind have arrived.
     """
 
     PATIENCE = 32
@@ -51,20 +51,32 @@ class Pairing(Generic[C, D]):
                 self._depths.popleft()
                 self.depth_alone += 1
             near = [d for d in self._depths if d[0] <= stamp + self.tolerance_ns]
-            later = len(self._depths) > len(near)
-            # An exact match is final; otherwise a nearer depth may still come.
-            if not ((near and near[-1][0] >= stamp) or later or last or self._impatient()):
+            if not (last or self._impatient() or self._is_final(stamp, near)):
                 return
+            best = self._nearest(stamp, near)
             self._colors.popleft()
-            if not near:
+            if best is None:
                 self.color_alone += 1
                 yield color, None
                 continue
-            best = min(near, key=lambda d: abs(d[0] - stamp))
             while self._depths[0] is not best:
                 self._depths.popleft()
                 self.depth_alone += 1
             yield color, self._depths.popleft()[1]
 
+    def _is_final(self, stamp: int, near: list[tuple[int, D]]) -> bool:
+        """Whether nothing that is still to come can change the partner of the first colour."""
+        if any(d[0] == stamp for d in near):
+            return True
+        if near and near[-1][0] > stamp:
+            return len(self._colors) > 1  # a later depth may belong to the next colour
+        return len(self._depths) > len(near)
+
+    def _nearest(self, stamp: int, near: list[tuple[int, D]]) -> tuple[int, D] | None:
+        """Return the nearest depth item that is not nearer to the next colour item."""
+        after = self._colors[1][0] if len(self._colors) > 1 else None
+        free = [d for d in near if after is None or abs(d[0] - stamp) <= abs(d[0] - after)]
+        return min(free, key=lambda d: abs(d[0] - stamp), default=None)
+
     def _impatient(self) -> bool:
-        return len(self._colors) > self.PATIENCE
+        return max(len(self._colors), len(self._depths)) > self.PATIENCE

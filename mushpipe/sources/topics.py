@@ -38,12 +38,12 @@ def choose_topics(
     ``camera_info`` beside the colour image.
 
     Raises:
-        InputError: No colour images, several candidates, or a named topic is not there.
+        InputError: No colour images, several candidates, or a named topic is not there or
+            holds something else.
     """
-    for wanted in (color, depth, camera):
-        if wanted is not None and wanted not in index.channels:
-            hint = suggest(wanted, sorted(index.channels))
-            raise InputError(f"{path}: there is no topic '{wanted}'; {hint}")
+    for wanted, kinds in ((color, IMAGES), (depth, IMAGES), (camera, CALIBRATIONS)):
+        if wanted is not None:
+            _check_named(index, path, wanted, kinds)
     images = _topics(index, IMAGES)
     color = color or _one(path, "color", _colors(images))
     if color is None:
@@ -51,6 +51,16 @@ def choose_topics(
         raise InputError(f"{path}: it holds no colour images (it holds {found})")
     depth = depth or _one(path, "depth", _depths(images))
     return Topics(color, depth, camera or _calibration(index, path, color))
+
+
+def _check_named(index: Index, path: Path, topic: str, kinds: set[str]) -> None:
+    if topic not in index.channels:
+        hint = suggest(topic, sorted(index.channels))
+        raise InputError(f"{path}: there is no topic '{topic}'; {hint}")
+    schema = index.schema_name(topic) or "messages without a schema"
+    if schema not in kinds:
+        expected = " or ".join(sorted(kinds))
+        raise InputError(f"{path}: topic '{topic}' holds {schema}, expected {expected}")
 
 
 def _topics(index: Index, schemas: set[str]) -> list[str]:

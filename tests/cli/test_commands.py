@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
 
 from mushpipe.core.errors import EXIT_DAMAGED, EXIT_FAILED, EXIT_USAGE
 
@@ -222,3 +223,27 @@ def test_the_graphs_of_the_project_run(graph: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     picks = json.loads(mushpipe("export", tmp_path / "log.mcap", cwd=tmp_path).stdout)["picks"]
     assert len(picks) > 10
+
+
+def test_a_recording_is_never_written_over_by_its_own_run(folder: Path) -> None:
+    mushpipe("record", "--source", "synthetic", "--frames", 1, "-o", "a.mcap", cwd=folder)
+    before = (folder / "a.mcap").read_bytes()
+    done = mushpipe("record", "--source", "a.mcap", "-o", "./a.mcap", cwd=folder)
+    assert done.returncode == EXIT_USAGE
+    assert "sink 'recorder' would write over its own source" in done.stderr
+    assert (folder / "a.mcap").read_bytes() == before
+
+
+def test_the_results_of_a_failed_run_say_how_it_ended(folder: Path) -> None:
+    (folder / "mine.py").write_text(
+        "from mushpipe import Mask, RgbdFrame, Stage\n\n"
+        "class Picky(Stage):\n"
+        "    def process(self, frame: RgbdFrame) -> Mask:\n"
+        "        raise RuntimeError('never')\n"
+    )
+    mushpipe("run", "graph.yaml", "--set", "segment.use=./mine.py:Picky", cwd=folder)
+    with (folder / "out.mcap").open("rb") as file:
+        metadata = {m.name: m.metadata for m in make_reader(file).iter_metadata()}
+    summary = json.loads(metadata["mushpipe.summary"]["json"])
+    assert summary["exit_code"] == EXIT_FAILED
+    assert summary["frames"]["failed"] == 1

@@ -144,6 +144,7 @@ def rgbd(frames: Iterable[int]) -> list[Entry]:
 
 def write_bag(folder: Path, entries: Iterable[Entry], name: str = "bag") -> Path:
     """Write (topic, log time, message) as a ROS 2 bag and return its MCAP file."""
+    folder.mkdir(parents=True, exist_ok=True)
     writer = Writer(folder / name, version=9, storage_plugin=StoragePlugin.MCAP)
     connections: dict[str, Any] = {}
     with writer:
@@ -155,10 +156,15 @@ def write_bag(folder: Path, entries: Iterable[Entry], name: str = "bag") -> Path
     return folder / name / f"{name}.mcap"
 
 
-def write_foxglove(path: Path, frames: int, chunk_size: int | None = 1) -> Path:
+def write_foxglove(
+    path: Path,
+    frames: int,
+    chunk_size: int | None = 1,
+    compression: MCAPCompression | None = MCAPCompression.Zstd,
+) -> Path:
     """Write the frames of `rgbd` as Foxglove messages; chunk_size 1 puts each in its own chunk."""
     context = foxglove.Context()
-    options = MCAPWriteOptions(compression=MCAPCompression.Zstd, chunk_size=chunk_size)
+    options = MCAPWriteOptions(compression=compression, chunk_size=chunk_size)
     with foxglove.open_mcap(path, context=context, writer_options=options):
         for topic, log_time, message in foxglove_entries(frames):
             channel = getattr(foxglove.channels, f"{type(message).__name__}Channel")

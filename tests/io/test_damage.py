@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.writer import Writer
 
 from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.types import RgbdFrame
 from mushpipe.sources.mcap import McapSource
 from tests.io.bags import (
-    ALIGNED,
     COLOR,
     PERIOD,
     T0,
@@ -110,3 +110,153 @@ def test_flipped_bits_never_pass_for_images(
     path = tmp_path_factory.getbasetemp() / "flipped.mcap"
     frames, error = read_damaged(path, bytes(data))
     assert len(frames) == FRAMES or error is not None
+
+
+@pytest.mark.parametrize("chunk", range(2 + 2 * FRAMES))
+def test_a_corrupt_chunk_costs_only_its_own_message(
+    chunk: int, whole: Path, tmp_path: Path
+) -> None:
+    data = bytearray(whole.read_bytes())
+    end = [end for opcode, end in borders(bytes(data)) if opcode == 6][chunk]
+    data[end - 5] ^= 0xFF
+    frames, error = read_damaged(tmp_path / "flipped.mcap", bytes(data))
+    lost_color = chunk >= 2 and chunk % 2 == 0
+    lost_depth = chunk >= 2 and chunk % 2 == 1
+    assert len(frames) == FRAMES - lost_color
+    assert sum(frame.depth is None for frame in frames) == lost_depth
+    assert "a chunk is corrupt" in str(error)
+    assert f"{len(frames)} frames could be read" in str(error)
+
+
+def test_a_damaged_index_costs_nothing_but_is_reported(whole: Path, tmp_path: Path) -> None:
+    data = bytearray(whole.read_bytes())
+    # The topics are named twice: in a compressed chunk, and in the clear in the index.
+    at = data.rfind(COLOR.encode())
+    data[at + 3] ^= 1
+    frames, error = read_damaged(tmp_path / "index.mcap", bytes(data))
+    assert len(frames) == FRAMES
+    assert all(frame.depth is not None and frame.camera is not None for frame in frames)
+    assert "its index is corrupt" in str(error)
+
+
+def test_a_record_whose_type_is_damaged_is_missed(whole: Path, tmp_path: Path) -> None:
+    data = bytearray(whole.read_bytes())
+    third = [end for opcode, end in borders(bytes(data)) if opcode == 6][2]
+    data[third] ^= 0x80  # the index of chunk 3; a message index may be lost without harm
+    assert read_damaged(tmp_path / "a.mcap", bytes(data))[1] is None
+    start = max(end for _, end in borders(bytes(data)) if end < third)
+    data[start] ^= 0x80  # chunk 3 itself: the first colour image
+    frames, error = read_damaged(tmp_path / "b.mcap", bytes(data))
+    assert len(frames) == FRAMES - 1
+    assert "1 of its messages are missing" in str(error)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "the file is empty"),
+        (b"#ROSBAG V2.0\n", "not an MCAP file (it begins with b'#ROSBAG ')"),
+        (b"\x89MC", "not an MCAP file"),
+    ],
+)
+def test_a_file_that_is_no_recording_is_refused(
+    content: bytes, message: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_bytes(content)
+    with pytest.raises(InputError) as error:
+        play(path)
+    assert str(error.value).startswith(f"{path}: {message}")
+    assert error.value.exit_code == 4
+
+
+def test_a_file_of_nothing_but_magic_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_bytes(b"\x89MCAP0\r\n")
+    with pytest.raises(InputError, match=r"it breaks off.*nothing could be read"):
+        play(path)
+
+
+def test_a_missing_file_is_a_mistake_of_the_user(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="there is no such recording"):
+        play(tmp_path / "x.mcap")
+
+
+def test_a_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be read: Is a directory"):
+        play(tmp_path)
+
+
+def test_a_recording_without_images_names_what_it_holds(tmp_path: Path) -> None:
+    text = ros("std_msgs/msg/String", data="hello")
+    path = write_bag(tmp_path, [("/chatter", T0, text), ("/rosout", T0, text)])
+    with pytest.raises(InputError) as error:
+        play(path)
+    assert str(error.value) == f"{path}: it holds no colour images (it holds /chatter, /rosout)"
+
+
+def test_a_recording_without_anything_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no colour images \\(it holds no topics at all\\)"):
+        play(write_foxglove_empty(tmp_path / "empty.mcap"))
+
+
+def write_foxglove_empty(path: Path) -> Path:
+    import foxglove
+
+    foxglove.open_mcap(path, context=foxglove.Context()).close()
+    return path
+
+
+def test_images_that_cannot_be_decoded_are_counted_and_the_others_played(tmp_path: Path) -> None:
+    short = raw_image(color_pixels(1), "rgb8", data=b"short")
+    broken = (COLOR, T0 + PERIOD, short)
+    entries = [*rgbd([0]), broken, depth_at(1), color_at(2), *rgbd([3])[1:]]
+    source = McapSource(path=write_bag(tmp_path, entries))
+    frames, error = drain(source)
+    assert [round((f.header.stamp_ns - T0) / PERIOD) for f in frames] == [0, 2, 3]
+    assert source.counts() == {
+        "colour images without depth": 1,
+        "depth images without colour": 1,
+        "images that could not be decoded": 1,
+    }
+    assert error is not None
+    assert f"{COLOR}: 8x6 image with step 24 in 5 bytes" in str(error)
+    assert "3 frames could be read" in str(error)
+
+
+def test_garbage_in_place_of_a_jpeg_is_counted(tmp_path: Path) -> None:
+    topic = COLOR + "/compressed"
+    entries = [
+        (topic, T0 + i, compressed(bytes([i] * 50), "rgb8; jpeg compressed bgr8", T0 + i))
+        for i in range(3)
+    ]
+    source = McapSource(path=write_bag(tmp_path, entries))
+    frames, error = drain(source)
+    assert frames == []
+    assert source.counts() == {"images that could not be decoded": 3}
+    assert "compressed image (rgb8; jpeg compressed bgr8) cannot be decoded" in str(error)
+
+
+def test_an_unknown_message_encoding_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "ros1.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("sensor_msgs/msg/Image", "ros1msg", b"")
+        channel = writer.register_channel(COLOR, "ros1", schema)
+        writer.add_message(channel, T0, b"\0" * 50, T0)
+        writer.finish()
+    frames, error = drain(McapSource(path=path))
+    assert frames == []
+    assert f"{COLOR}: message encoding 'ros1' is not supported" in str(error)
+
+
+def test_messages_that_are_no_ros_messages_are_counted(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, [color_at(0), depth_at(0), color_at(1), depth_at(1)])
+    data = path.read_bytes()
+    # rosbags writes neither compression nor CRC, so a frame_id can be made something not UTF-8.
+    at = data.find(b"camera_color_optical_frame")
+    path.write_bytes(data[:at] + b"\xff" + data[at + 1 :])
+    frames, error = drain(McapSource(path=path))
+    assert len(frames) == 1
+    assert "utf-8" in str(error)

@@ -1,0 +1,1 @@
+"""Judging results against the truth: matching, errors with intervals, tables and reports."""

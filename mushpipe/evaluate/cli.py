@@ -1,0 +1,184 @@
+"""The verb `mushpipe eval`; everything heavy is imported when it runs."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import threading
+from collections.abc import Iterable
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from mushpipe.core.plan import Plan
+    from mushpipe.core.report import RunReport
+    from mushpipe.evaluate.command import Request
+    from mushpipe.evaluate.judging import Rules
+
+
+class Form(StrEnum):
+    """How the outcome is printed."""
+
+    text = "text"
+    json = "json"
+
+
+TargetsArgument = Annotated[
+    list[Path], typer.Argument(help="results to judge; or a graph to run, then recordings")
+]
+TruthOption = Annotated[
+    list[Path] | None,
+    typer.Option(help="labels (JSON) or a recording with truth; one for all, or one each"),
+]
+RecordingsOption = Annotated[
+    list[Path] | None, typer.Option(help="what the graph runs on; a folder is all in it")
+]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="A.B=VALUE", help="change a setting of the graph"),
+]
+FramesOption = Annotated[int | None, typer.Option(help="stop each recording after N frames")]
+MatrixOption = Annotated[
+    list[str] | None, typer.Option(metavar="A.B=X,Y", help="compare alternatives with the first")
+]
+ThresholdOption = Annotated[
+    list[str] | None,
+    typer.Option(metavar="METRIC>=X", help="exit with 3 where missed: 'f>=0.98'"),
+]
+PlaneOption = Annotated[
+    str | None,
+    typer.Option(metavar="METRES", help="judge the depth of a plane so far away; one, or one each"),
+]
+IouOption = Annotated[float, typer.Option(min=0.01, max=1, help="circle IoU of a match")]
+GravityOption = Annotated[
+    str, typer.Option(metavar="X,Y,Z", help="direction of gravity in the camera's frame")
+]
+TopicOption = Annotated[str | None, typer.Option(help="what to judge, where there is a choice")]
+ResamplesOption = Annotated[int, typer.Option(min=0, help="bootstrap samples; 0 is none")]
+SeedOption = Annotated[int, typer.Option(min=0, help="seed of the bootstrap")]
+OutOption = Annotated[Path | None, typer.Option(help="folder to keep the graph's results in")]
+ReportOption = Annotated[Path | None, typer.Option(help="folder for a page with plots")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb to the program."""
+    app.command("eval")(evaluate)
+
+
+def evaluate(
+    targets: TargetsArgument,
+    truth: TruthOption = None,
+    recordings: RecordingsOption = None,
+    set_: SetOption = None,
+    frames: FramesOption = None,
+    matrix: MatrixOption = None,
+    threshold: ThresholdOption = None,
+    plane: PlaneOption = None,
+    iou: IouOption = 0.5,
+    gravity: GravityOption = "0,0,1",
+    topic: TopicOption = None,
+    resamples: ResamplesOption = 1000,
+    seed: SeedOption = 0,
+    out: OutOption = None,
+    report: ReportOption = None,
+    output: Annotated[Form, typer.Option("--format")] = Form.text,
+) -> None:
+    """Judge results against the truth, or run a graph and judge that."""
+    from mushpipe.console import set_up_logging
+    from mushpipe.evaluate.command import Request
+    from mushpipe.evaluate.judging import Rules
+
+    set_up_logging(False)
+    rules = Rules(iou, _up(gravity), resamples, seed)
+    if plane is not None:
+        raise typer.Exit(_planes(targets, plane, threshold or [], rules, output))
+    limit = [] if frames is None else [f"source.max_frames={frames}"]
+    overrides = [*limit, *(set_ or [])]
+    request = Request(targets, truth or [], recordings or [], overrides, matrix or [])
+    request.thresholds, request.topic, request.rules = threshold or [], topic, rules
+    raise typer.Exit(_judge(request, out, report, output))
+
+
+def _judge(request: Request, out: Path | None, report: Path | None, output: Form) -> int:
+    from mushpipe.evaluate.command import perform
+
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+    # Frames for the page may stand in the temporary results, so those live until it is written.
+    with tempfile.TemporaryDirectory(prefix="mushpipe-eval-") as temporary:
+        judgement = perform(request, out or Path(temporary), _run)
+        if output is Form.json:
+            from mushpipe.evaluate.plain import judgement_json
+
+            _write(judgement_json(judgement))
+        else:
+            from mushpipe.evaluate.show import judgement_tables
+
+            _print(judgement_tables(judgement))
+        if report is not None:
+            from mushpipe.console import stderr
+            from mushpipe.evaluate.report import write_report
+
+            stderr.print(f"report: {write_report(judgement, report)}", style="dim")
+    return judgement.exit_code
+
+
+def _planes(
+    files: list[Path], plane: str, thresholds: list[str], rules: Rules, output: Form
+) -> int:
+    from mushpipe.evaluate.plane import judge_planes
+
+    rows, outcomes, code = judge_planes(files, plane, thresholds, rules.resamples, rules.seed)
+    if output is Form.json:
+        from mushpipe.evaluate.plain import planes_json
+
+        _write(planes_json(rows, outcomes, code))
+    else:
+        from mushpipe.evaluate.show import plane_table, threshold_table
+
+        checked = [threshold_table([("", item) for item in outcomes])] if outcomes else []
+        _print([plane_table(rows), *checked])
+    return code
+
+
+def _up(gravity: str) -> tuple[float, ...]:
+    """Return the direction against gravity."""
+    from mushpipe.core.errors import UsageError
+
+    try:
+        up = tuple(-float(part) for part in gravity.split(","))
+    except ValueError:
+        up = ()
+    if len(up) != 3 or not sum(x * x for x in up) > 0:
+        raise UsageError(f"--gravity {gravity}: expected X,Y,Z, not all 0")
+    return up
+
+
+def _run(plan: Plan) -> RunReport:
+    from mushpipe.console import interruptible, progress_bar
+    from mushpipe.core.run import run
+
+    stop = threading.Event()
+    with interruptible(stop), progress_bar() as show:
+        report = run(plan, stop, show)
+    if report.interrupted:
+        raise typer.Exit(report.exit_code)
+    return report
+
+
+def _write(text: str) -> None:
+    sys.stdout.write(text + "\n")
+
+
+def _print(items: Iterable[Any]) -> None:
+    from rich.console import Console
+
+    console = Console(file=sys.stdout, highlight=False, markup=False)
+    if not console.is_terminal:
+        console = Console(file=sys.stdout, highlight=False, markup=False, width=200)
+    for item in items:
+        console.print(item)
+        console.print()

@@ -1,0 +1,253 @@
+"""What `mushpipe eval` does: run where asked to, judge, compare, hold against thresholds."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mushpipe.core.errors import EXIT_DAMAGED, EXIT_DIFFERS, EXIT_OK, InputError, UsageError
+from mushpipe.core.plan import Plan
+from mushpipe.core.report import RunReport
+from mushpipe.evaluate.compare import differences
+from mushpipe.evaluate.events import events_of
+from mushpipe.evaluate.judging import (
+    Evaluation,
+    Judged,
+    Rules,
+    Summary,
+    find_truth,
+    judge_results,
+    summarise,
+)
+from mushpipe.evaluate.metrics import METRICS, Value
+from mushpipe.evaluate.results import read_results
+from mushpipe.evaluate.running import (
+    Alternative,
+    alternatives,
+    plans,
+    recordings_in,
+    require_results,
+    result_path,
+)
+from mushpipe.evaluate.speed import named, speed_of
+from mushpipe.evaluate.thresholds import Outcome, check, parse_threshold, require_known
+from mushpipe.evaluate.truth import TruthSet, has_truth, read_truth
+
+logger = logging.getLogger("mushpipe")
+GRAPHS = (".yaml", ".yml")
+Runner = Callable[[Plan], RunReport]
+
+
+@dataclass
+class Request:
+    """The command line of `mushpipe eval`, apart from how the outcome is shown."""
+
+    targets: list[Path]
+    truth: list[Path] = field(default_factory=list)
+    recordings: list[Path] = field(default_factory=list)
+    overrides: list[str] = field(default_factory=list)
+    matrix: list[str] = field(default_factory=list)
+    thresholds: list[str] = field(default_factory=list)
+    topic: str | None = None
+    rules: Rules = field(default_factory=Rules)
+
+    def graph(self) -> Path | None:
+        """Return the graph among the targets; None where all are results.
+
+        Raises:
+            UsageError: There are several, or options that need one.
+        """
+        graphs = [path for path in self.targets if path.suffix in GRAPHS]
+        if len(graphs) > 1:
+            raise UsageError("give one graph; --matrix compares alternatives of it")
+        if not graphs and (self.recordings or self.matrix or self.overrides):
+            raise UsageError("--recordings, --matrix, --set and --frames need a graph to run")
+        return graphs[0] if graphs else None
+
+
+@dataclass(frozen=True)
+class Section:
+    """One alternative with its figures."""
+
+    evaluation: Evaluation
+    overall: Summary
+    recordings: list[Summary]
+    speed: dict[str, dict[str, float]]
+
+    @property
+    def label(self) -> str:
+        """Name of the alternative, "" where there is one only."""
+        return self.evaluation.label
+
+    def named(self) -> dict[str, float]:
+        """Return every figure a threshold can be set on."""
+        values = {name: value.value for name, value in self.overall.values.items()}
+        return values | named(self.speed)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Paired differences of an alternative to the first one."""
+
+    label: str
+    base: str
+    frames: int
+    values: dict[str, Value]
+
+
+@dataclass
+class Judgement:
+    """All that `mushpipe eval` has to say."""
+
+    sections: list[Section]
+    comparisons: list[Comparison]
+    outcomes: list[tuple[str, Outcome]]
+    run_exit_code: int = EXIT_OK
+
+    @property
+    def damage(self) -> list[str]:
+        """What could not be read, in words."""
+        texts = [text for section in self.sections for text in section.evaluation.damage]
+        return list(dict.fromkeys(texts))
+
+    @property
+    def exit_code(self) -> int:
+        """0, that of a failed run, 4 where a file is damaged, 3 where a threshold is missed."""
+        if self.run_exit_code or self.damage:
+            return self.run_exit_code or EXIT_DAMAGED
+        return EXIT_OK if all(outcome.kept for _, outcome in self.outcomes) else EXIT_DIFFERS
+
+
+def perform(request: Request, folder: Path, runner: Runner) -> Judgement:
+    """Do what is asked.
+
+    Args:
+        request: The command line.
+        folder: Where the results of a graph go.
+        runner: Runs a plan.
+
+    Raises:
+        MushpipeError: Nothing can be judged.
+    """
+    thresholds = [parse_threshold(text) for text in request.thresholds]
+    early = [t for t in thresholds if not t.name.startswith("speed_")]
+    require_known(early, METRICS)
+    graph = request.graph()
+    code = EXIT_OK
+    if graph is None:
+        evaluations = [_judge_files(request)]
+    else:
+        evaluations, code = _judge_graph(request, graph, folder, runner)
+    sections = [_section(evaluation) for evaluation in evaluations]
+    for section in sections:
+        require_known(thresholds, section.named())
+    return Judgement(
+        sections,
+        [_compare(evaluations[0], other) for other in evaluations[1:]],
+        [(s.label, outcome) for s in sections for outcome in check(thresholds, s.named())],
+        code,
+    )
+
+
+def _judge_files(request: Request) -> Evaluation:
+    files = recordings_in(request.targets)
+    truths = _given_truth(request, len(files))
+    evaluation = Evaluation(request.rules)
+    for file, truth in zip(files, truths, strict=True):
+        results = read_results(file, request.topic)
+        judged = judge_results(results, truth or find_truth(results), request.rules)
+        evaluation.recordings.append(judged)
+    _require_judged(evaluation)
+    return evaluation
+
+
+def _given_truth(request: Request, files: int) -> Sequence[TruthSet | None]:
+    """Return the truth given for each file: one file of truth serves them all."""
+    given = [read_truth(path) for path in request.truth]
+    if len(given) not in (0, 1, files):
+        raise UsageError(f"{len(given)} times --truth for {files} recordings: give one, or as many")
+    return given * files if len(given) == 1 else given or [None] * files
+
+
+def _judge_graph(
+    request: Request, graph: Path, folder: Path, runner: Runner
+) -> tuple[list[Evaluation], int]:
+    others = [path for path in request.targets if path != graph]
+    recordings = recordings_in([*request.recordings, *others])
+    truths: Sequence[TruthSet | None]
+    if recordings and not request.truth:
+        recordings = _with_truth(recordings)
+        truths = [read_truth(path) for path in recordings]
+    else:
+        truths = _given_truth(request, max(1, len(recordings)))
+    options = alternatives(request.matrix) if request.matrix else [Alternative("")]
+    evaluations = {
+        option.label: Evaluation(request.rules, label=option.label) for option in options
+    }
+    worst = EXIT_OK
+    for option, number, plan in plans(graph, recordings, request.overrides, options, folder):
+        report = runner(plan)
+        require_results(report)
+        worst = worst or report.exit_code
+        judged = _judge_run(request, plan, truths[number], recordings[number : number + 1])
+        evaluations[option.label].recordings.append(judged)
+    for evaluation in evaluations.values():
+        _require_judged(evaluation)
+    return list(evaluations.values()), worst
+
+
+def _judge_run(
+    request: Request, plan: Plan, truth: TruthSet | None, recording: Sequence[Path]
+) -> Judged:
+    results = read_results(result_path(plan), request.topic)
+    known = truth or find_truth(results)
+    return judge_results(results, known, request.rules, recording[0] if recording else None)
+
+
+def _with_truth(recordings: list[Path]) -> list[Path]:
+    kept = [path for path in recordings if has_truth(path)]
+    for path in recordings:
+        if path not in kept:
+            logger.warning("%s carries no truth and is left out", path)
+    if not kept:
+        raise InputError("none of the recordings carries truth; give labels with --truth")
+    return kept
+
+
+def _require_judged(evaluation: Evaluation) -> None:
+    if not evaluation.verdicts:
+        names = ", ".join(judged.truth.name for judged in evaluation.recordings)
+        raise InputError(f"no frame of the results is labelled in {names}")
+
+
+def _section(evaluation: Evaluation) -> Section:
+    rules, parts = evaluation.rules, evaluation.recordings
+    overall = summarise("overall", evaluation.verdicts, rules)
+    single = len(parts) == 1
+    return Section(
+        evaluation,
+        overall,
+        [overall if single else summarise(part.name, part.verdicts, rules) for part in parts],
+        speed_of(part.results for part in parts),
+    )
+
+
+def _compare(base: Evaluation, other: Evaluation) -> Comparison:
+    """Compare two alternatives on the frames that both were judged on."""
+    sides = [
+        {(number, v.place): v for number, part in enumerate(e.recordings) for v in part.verdicts}
+        for e in (base, other)
+    ]
+    common = [key for key in sides[0] if key in sides[1]]
+    first, second = ([side[key] for key in common] for side in sides)
+    rules = base.rules
+    values = differences(
+        events_of(first, rules.up),
+        events_of(second, rules.up),
+        len(common),
+        rules.resamples,
+        rules.seed,
+    )
+    return Comparison(other.label, base.label, len(common), values)

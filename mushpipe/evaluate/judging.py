@@ -1,0 +1,188 @@
+"""From result recordings to an evaluation: find the truth, judge every frame, count the rest."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mushpipe.core.errors import InputError
+from mushpipe.evaluate.events import UP, Events, Verdict, comparable, events_of, judge
+from mushpipe.evaluate.metrics import Value, measure
+from mushpipe.evaluate.results import Results, none_found
+from mushpipe.evaluate.truth import Place, TruthSet, has_truth, read_truth
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How to judge.
+
+    Attributes:
+        iou: Smallest circle IoU of a match.
+        up: Direction against gravity in the camera's frame.
+        resamples: Number of bootstrap samples.
+        seed: Seed of the bootstrap.
+    """
+
+    iou: float = 0.5
+    up: Sequence[float] = UP
+    resamples: int = 1000
+    seed: int = 0
+
+
+@dataclass
+class Judged:
+    """The judged frames of one recording, and what was noticed on the way."""
+
+    name: str
+    results: Results
+    truth: TruthSet
+    recording: Path | None = None
+    verdicts: list[Verdict] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass
+class Evaluation:
+    """Judged recordings under one label (the alternative of a matrix, or "")."""
+
+    rules: Rules
+    recordings: list[Judged] = field(default_factory=list)
+    label: str = ""
+
+    @property
+    def verdicts(self) -> list[Verdict]:
+        """All judged frames."""
+        return [verdict for judged in self.recordings for verdict in judged.verdicts]
+
+    @property
+    def damage(self) -> list[str]:
+        """What could not be read, in words."""
+        return [
+            f"{name}: {text}"
+            for judged in self.recordings
+            for name, texts in (
+                (judged.results.path.name, judged.results.damage),
+                (judged.truth.name, judged.truth.damage),
+            )
+            for text in texts
+        ]
+
+    def events(self) -> Events:
+        """Return what happened in all frames."""
+        return events_of(self.verdicts, self.rules.up)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The figures of one recording, or of all: what was counted, and the metrics by name."""
+
+    name: str
+    frames: int
+    truths: int
+    found: int
+    missed: int
+    false: int
+    ignored: int
+    values: dict[str, Value]
+
+
+def summarise(name: str, verdicts: Sequence[Verdict], rules: Rules) -> Summary:
+    """Return the figures of judged frames."""
+    events = events_of(verdicts, rules.up)
+    matchings = [verdict.matching for verdict in verdicts]
+    found, missed = (sum(len(getattr(m, k)) for m in matchings) for k in ("truth", "missed"))
+    return Summary(
+        name=name,
+        frames=len(verdicts),
+        truths=found + missed,
+        found=found,
+        missed=missed,
+        false=sum(len(m.false) for m in matchings),
+        ignored=sum(len(m.ignored) for m in matchings),
+        values=measure(events, len(verdicts), rules.resamples, rules.seed),
+    )
+
+
+def judge_results(
+    results: Results, truth: TruthSet, rules: Rules, recording: Path | None = None
+) -> Judged:
+    """Judge every frame whose truth is known.
+
+    A frame with truth that the results do not answer counts as one in which nothing was found,
+    unless the run was asked for a part of the recording and the frame is outside of it.
+
+    Args:
+        results: What was found.
+        truth: What is there.
+        rules: How to judge.
+        recording: What the results were made from, where it is at hand.
+    """
+    judged = Judged((recording or results.path).stem, results, truth, recording)
+    for header, detections in results.frames:
+        place = truth.place(header)
+        if place is not None:
+            known = truth.frames[place]
+            judged.verdicts.append(judge(judged.name, place, known, header, detections, rules.iou))
+    if len(judged.verdicts) < len(results.frames):
+        unknown = len(results.frames) - len(judged.verdicts)
+        judged.notes.append(f"{unknown} frames have no truth and are not judged")
+    if not all(map(comparable, judged.verdicts)):
+        judged.notes.append("truth and results are in different frames: 3D errors are unknown")
+    unanswered = _unanswered(judged)
+    if unanswered:
+        judged.notes.append(f"{len(unanswered)} frames have no answer: all in them is missed")
+    for place in unanswered:
+        known = truth.frames[place]
+        judged.verdicts.append(judge(judged.name, place, known, None, none_found(), rules.iou))
+    judged.verdicts.sort(key=lambda verdict: verdict.place)
+    return judged
+
+
+def _unanswered(judged: Judged) -> list[Place]:
+    """Return the frames with truth that were not answered and should have been."""
+    answered = {verdict.place for verdict in judged.verdicts}
+    if not answered:
+        return []  # these results and this truth have nothing to do with each other
+    first, last = min(answered), max(answered)
+    return [
+        place
+        for place in judged.truth.frames
+        if place not in answered and (first <= place <= last or not judged.results.partial)
+    ]
+
+
+def find_truth(results: Results) -> TruthSet:
+    """Return the truth of results: their own, or that of the recording they were made from.
+
+    Raises:
+        InputError: Neither is to be found; a recording counts only with the SHA-256 that the
+            results state.
+    """
+    if has_truth(results.path):
+        return read_truth(results.path)
+    stated = results.manifest.get("recordings") or [{}]
+    path = origin(results)
+    if path is None:
+        of = f" of {stated[0]['file']}" if stated[0].get("file") else ""
+        raise InputError(f"{results.path}: the truth{of} is not to be found; give it with --truth")
+    if not has_truth(path):
+        raise InputError(f"{path}: it carries no truth; give labels with --truth")
+    return read_truth(path)
+
+
+def origin(results: Results) -> Path | None:
+    """Return the recording that results were made from, where it is still to be found."""
+    source = Path(str(results.manifest.get("graph", {}).get("source", {}).get("path", "")))
+    stated = (results.manifest.get("recordings") or [{}])[0]
+    folder = results.path.parent
+    for path in (source, folder / source, folder / source.name):
+        if path.is_file() and _sha256(path) == stated.get("sha256"):
+            return path
+    return None
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

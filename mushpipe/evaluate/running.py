@@ -1,0 +1,140 @@
+"""Running a graph for evaluation: on each recording, once per alternative of a matrix."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mushpipe.core.document import read_document
+from mushpipe.core.errors import UsageError
+from mushpipe.core.graph import compile_document
+from mushpipe.core.plan import Plan
+from mushpipe.core.plugins import Registry, load_registry
+from mushpipe.core.report import RunReport
+from mushpipe.core.stage import RunInfo, Sink, Source
+
+SINK = "evaluation"
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """A way to set the graph: its name in tables, and what it overrides."""
+
+    label: str
+    overrides: tuple[str, ...] = ()
+
+
+def alternatives(matrix: Iterable[str]) -> list[Alternative]:
+    """Return every combination of ``a.b=x,y`` texts; the first is what others are compared with.
+
+    Commas within brackets belong to a value: ``detect.radius_px=[8,38],[8,45]``.
+
+    Raises:
+        UsageError: A text has no values, or the same twice.
+    """
+    axes = []
+    for text in matrix:
+        path, equals, values = text.partition("=")
+        options = [value.strip() for value in _split(values)]
+        if not equals or not all(options) or len(set(options)) < len(options):
+            raise UsageError(f"--matrix {text}: expected a.b=value,other with different values")
+        axes.append([f"{path.strip()}={value}" for value in options])
+    return [Alternative(" ".join(chosen), chosen) for chosen in itertools.product(*axes)]
+
+
+def _split(values: str) -> list[str]:
+    """Split at the commas that stand outside of brackets."""
+    parts, depth = [""], 0
+    for letter in values:
+        depth += (letter in "[{") - (letter in "]}")
+        if letter == "," and depth == 0:
+            parts.append("")
+        else:
+            parts[-1] += letter
+    return parts
+
+
+def recordings_in(paths: Sequence[Path]) -> list[Path]:
+    """Return the recordings that paths name; a folder stands for all ``*.mcap`` in it.
+
+    Raises:
+        UsageError: A folder holds none.
+    """
+    found: list[Path] = []
+    for path in paths:
+        files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+        if not files:
+            raise UsageError(f"{path}: the folder holds no recordings (*.mcap)")
+        found += files
+    return found
+
+
+def plan_for(
+    graph: Path, recording: Path | None, overrides: Iterable[str], out: Path, registry: Registry
+) -> Plan:
+    """Compile a graph so that its results go to a file, and nowhere else.
+
+    Its own sinks are left out: an evaluation must not reach a robot or write over results.
+    The frames are recorded too where the source is not a recording that can be read again.
+
+    Raises:
+        GraphError: With every problem of the graph and the overrides.
+    """
+    document = read_document(graph)
+    source = document.data.get("source")
+    replayed = recording is not None or (isinstance(source, dict) and source.get("use") == "mcap")
+    sink = {"use": "mcap", "path": str(out.absolute()), "frames": not replayed}
+    document.data["sinks"] = {SINK: sink}
+    return compile_document(
+        document, registry, overrides, None if recording is None else str(recording)
+    )
+
+
+def result_path(plan: Plan) -> Path:
+    """Return the file that a plan made by `plan_for` writes."""
+    source = plan.source.plugin
+    info = RunInfo(source.name() if isinstance(source, Source) else "", {})
+    sink = plan.sinks[0].plugin
+    if not isinstance(sink, Sink):
+        raise TypeError("the plan has no sink")
+    return sink.files(info)[0]
+
+
+def slug(alternative: Alternative) -> str:
+    """Return an alternative's label as part of a file name."""
+    return re.sub(r"[^A-Za-z0-9.=-]+", "_", alternative.label).strip("_")
+
+
+def plans(
+    graph: Path,
+    recordings: Sequence[Path],
+    overrides: Sequence[str],
+    options: Sequence[Alternative],
+    out: Path,
+) -> list[tuple[Alternative, int, Plan]]:
+    """Compile every run before the first begins, so that a fault in the last shows at once.
+
+    Returns:
+        Per run its alternative, the number of its recording, and what to run.
+    """
+    registry = load_registry()
+    sources: Sequence[Path | None] = recordings or [None]
+    result = []
+    for option in options:
+        for number, recording in enumerate(sources):
+            name = "results" if recording is None else recording.stem
+            if [r.stem for r in recordings].count(name) > 1:
+                name = f"{name}-{number}"
+            file = out / ".".join(filter(None, [name, slug(option), "mcap"]))
+            plan = plan_for(graph, recording, [*overrides, *option.overrides], file, registry)
+            result.append((option, number, plan))
+    return result
+
+
+def require_results(report: RunReport) -> None:
+    """Raise the error of a run that answered no frame at all."""
+    if report.error is not None and not report.processed:
+        raise report.error

@@ -1,0 +1,133 @@
+"""The truth of a recording: from its own truth topic, or from a file of labels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import orjson
+from pydantic import ValidationError
+
+from mushpipe.core.errors import InputError
+from mushpipe.core.recording import RecordingReader
+from mushpipe.core.tables import Floats
+from mushpipe.core.truth import TRUTH_TOPIC, Truth
+from mushpipe.core.types import Header
+from mushpipe.core.wire import decode_table
+from mushpipe.evaluate.labels import Frame, parse_labels, truth_of
+
+
+@dataclass(frozen=True, eq=False)
+class FrameTruth:
+    """What is in one frame.
+
+    Attributes:
+        caps: The mushrooms; those with an ignore reason count neither way.
+        may_find: (K, 3) circles ``u v radius`` px in which a detection counts neither way.
+        frame_id: Frame of the 3D values; None where the labels do not say it.
+    """
+
+    caps: Truth
+    may_find: Floats = field(default_factory=lambda: np.empty((0, 3)))
+    frame_id: str | None = None
+
+
+Place = tuple[Literal["stamp_ns", "index"], int]
+"""How a frame is found: by `Header.stamp_ns`, or by its number, `Header.sequence`."""
+
+
+@dataclass(frozen=True, eq=False)
+class TruthSet:
+    """The truth of the frames of a recording.
+
+    Attributes:
+        name: Where it comes from.
+        frames: The truth of each frame.
+        damage: What could not be read, in words.
+    """
+
+    name: str
+    frames: Mapping[Place, FrameTruth]
+    damage: tuple[str, ...] = ()
+
+    def place(self, header: Header) -> Place | None:
+        """Return where the truth of a frame stands; None where it is not known."""
+        places: tuple[Place, Place] = ("stamp_ns", header.stamp_ns), ("index", header.sequence)
+        return next((place for place in places if place in self.frames), None)
+
+
+def read_truth(path: Path) -> TruthSet:
+    """Read the truth from a recording (``.mcap``) or from labels (any other file).
+
+    Raises:
+        InputError: The file cannot be read, holds no truth, or is wrong.
+    """
+    return truth_of_recording(path) if path.suffix == ".mcap" else truth_of_labels(path)
+
+
+def has_truth(path: Path) -> bool:
+    """Return whether a recording carries its truth."""
+    return RecordingReader(path).index().counts[TRUTH_TOPIC] > 0
+
+
+def truth_of_recording(path: Path) -> TruthSet:
+    """Read the truth topic of a recording.
+
+    Raises:
+        InputError: It has none, or a message on it cannot be read.
+    """
+    reader = RecordingReader(path)
+    frames: dict[Place, FrameTruth] = {}
+    for raw in reader.messages({TRUTH_TOPIC}):
+        name = raw.schema.name if raw.schema else ""
+        try:
+            decoded = decode_table(name, raw.message.data, raw.message.log_time)
+        except (ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{path}: a message on {TRUTH_TOPIC}: {error}") from error
+        if decoded is None or not isinstance(decoded.table, Truth):
+            raise InputError(f"{path}: {TRUTH_TOPIC} holds '{name}', expected mushpipe.Truth")
+        header = decoded.header
+        frames["stamp_ns", header.stamp_ns] = FrameTruth(decoded.table, frame_id=header.frame_id)
+    if not frames:
+        raise InputError(f"{path}: it carries no truth (no messages on {TRUTH_TOPIC})")
+    return TruthSet(path.name, frames, tuple(reader.damage))
+
+
+def truth_of_labels(path: Path) -> TruthSet:
+    """Read a file of labels in the project's format or a foreign one; see `labels`.
+
+    Raises:
+        InputError: It is missing, no JSON, or no such labels.
+    """
+    try:
+        document = orjson.loads(path.read_bytes())
+        if not isinstance(document, dict):
+            raise ValueError("expected a JSON object")
+        labels = parse_labels(document)
+    except FileNotFoundError:
+        raise InputError(f"{path}: there are no such labels") from None
+    except ValidationError as error:
+        faults = [f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()]
+        raise InputError("\n  ".join([f"{path}: not valid labels:", *faults[:20]])) from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: no labels: {error}") from error
+    frames = {_place(frame): _frame_truth(path, frame, labels.frame_id) for frame in labels.frames}
+    if len(frames) < len(labels.frames):
+        raise InputError(f"{path}: a frame is labelled twice")
+    return TruthSet(path.name, frames)
+
+
+def _place(frame: Frame) -> Place:
+    return ("index", frame.index or 0) if frame.stamp_ns is None else ("stamp_ns", frame.stamp_ns)
+
+
+def _frame_truth(path: Path, frame: Frame, frame_id: str | None) -> FrameTruth:
+    circles = [[c.u, c.v, c.radius_px] for c in frame.may_find]
+    may_find = np.array(circles, dtype=float).reshape(-1, 3)
+    try:
+        return FrameTruth(truth_of(frame.caps), may_find, frame_id)
+    except ValueError as error:
+        raise InputError(f"{path}: frame {'='.join(map(str, _place(frame)))}: {error}") from error

@@ -1,0 +1,151 @@
+"""Fast producers and slow or failing consumers: what is dropped, what waits, what ends a run."""
+
+import threading
+from typing import ClassVar
+
+import pytest
+
+from mushpipe import Circles, RgbdFrame, Sink, Stage
+from tests.core.lab import Lab, make_frame, soon
+
+FULL = OSError("disk full")
+
+
+def test_of_two_waiting_live_frames_the_newest_wins(lab: Lab):
+    entered, release = threading.Event(), threading.Event()
+
+    def frames():
+        yield make_frame(0)
+        soon(entered)
+        yield make_frame(1)
+        yield make_frame(2)
+        release.set()
+
+    class Slow(Stage):
+        def process(self, frame: RgbdFrame) -> RgbdFrame:
+            entered.set()
+            soon(release)
+            return frame
+
+    lab.live(frames)
+    report = lab.run(lab.chain(Slow, source="live"))
+    assert [trace.frame.header.sequence for trace in lab.seen] == [0, 2]
+    assert (report.frames_in, report.processed, report.dropped) == (3, 2, 1)
+    assert report.balanced()
+    assert report.exit_code == 0
+
+
+class Gate:
+    """A live source of n frames, each waiting for the one before; a sink held until the last."""
+
+    def __init__(self, lab: Lab, n: int, delivery: str) -> None:
+        processed, entered, all_done = (
+            threading.Semaphore(0),
+            threading.Event(),
+            threading.Event(),
+        )
+        self.seen: list[int] = []
+        seen, preferred = self.seen, delivery
+
+        def frames():
+            for i in range(n):
+                yield make_frame(i)
+                processed.acquire(timeout=20)
+                soon(entered)
+
+        class Viewer(Sink):
+            delivery: ClassVar = preferred
+
+            def consume(self, frame: RgbdFrame) -> None:
+                entered.set()
+                soon(all_done)
+                seen.append(frame.header.sequence)
+
+        def progress(report) -> None:
+            if report.processed == n:
+                all_done.set()
+            processed.release()
+
+        lab.live(frames)
+        lab.registry.sink("viewer", Viewer)
+        self.progress = progress
+
+
+@pytest.mark.parametrize(
+    ("delivery", "entry", "shown"),
+    [
+        ("latest", "viewer", [0, 3]),
+        ("every", "viewer", [0, 1, 2, 3]),
+        ("latest", "viewer, delivery: every", [0, 1, 2, 3]),
+        ("every", "viewer, delivery: latest", [0, 3]),
+    ],
+)
+def test_a_slow_sink_of_a_live_run(lab: Lab, delivery, entry, shown):
+    gate = Gate(lab, 4, delivery)
+    text = lab.chain("threshold", source="live").replace("collect", entry)
+    report = lab.run(text, progress=gate.progress)
+    assert gate.seen == shown
+    sink = report.sinks["out"]
+    assert (sink.handed, sink.consumed, sink.dropped) == (4, len(shown), 4 - len(shown))
+    assert report.balanced()
+
+
+def test_a_slow_sink_of_a_replay_sees_every_frame(lab: Lab):
+    ahead, seen = threading.Event(), []
+
+    class Slow(Sink):
+        delivery: ClassVar = "latest"
+
+        def consume(self, frame: RgbdFrame) -> None:
+            soon(ahead)
+            seen.append(frame.header.sequence)
+
+    class Signal(Stage):
+        def process(self, frame: RgbdFrame) -> RgbdFrame:
+            if frame.header.sequence == 3:
+                ahead.set()
+            return frame
+
+    lab.registry.sink("slow", Slow)
+    report = lab.run(lab.chain(Signal).replace("collect", "slow"), "source.count=30")
+    assert seen == list(range(30))
+    assert report.sinks["out"].dropped == 0
+
+
+def failing_sink(lab: Lab, *sequences: int, error: BaseException = FULL) -> str:
+    class Picky(Sink):
+        def consume(self, frame: RgbdFrame, circles: Circles) -> None:
+            if frame.header.sequence in sequences:
+                raise error
+
+    lab.registry.sink("picky", Picky)
+    return lab.chain("fussy").replace("collect", "picky")
+
+
+def test_a_failing_sink_ends_a_replay(lab: Lab, tmp_path):
+    report = lab.run(failing_sink(lab, 1), "source.count=1000", capsules=tmp_path)
+    assert str(report.error) == "sink 'out' (picky) failed on frame 1: OSError: disk full"
+    assert report.exit_code == 1
+    assert report.processed < 1000
+    assert report.balanced()
+    assert report.capsules == [str(tmp_path / "failure-out-1.mcap")]
+
+
+def test_a_sink_that_wants_to_leave_does_not_hang_the_run(lab: Lab):
+    report = lab.run(failing_sink(lab, 1, error=SystemExit("bye")), "source.count=1000")
+    assert str(report.error) == "sink 'out' (picky) failed on frame 1: SystemExit: bye"
+
+
+SKIP = "\non_error: skip\nmax_failures: 3"
+
+
+def test_a_skipping_run_forgives_a_sink(lab: Lab):
+    report = lab.run(failing_sink(lab, 1, 2, 4) + SKIP, "source.count=6")
+    assert vars(report.sinks["out"]) == {"handed": 6, "consumed": 3, "dropped": 0, "failed": 3}
+    assert report.exit_code == 0
+
+
+def test_too_many_failures_of_a_sink_in_a_row_end_a_skipping_run(lab: Lab):
+    report = lab.run(failing_sink(lab, 1, 2, 3) + SKIP, "source.count=9")
+    assert report.balanced()
+    assert str(report.error) == "sink 'out' (picky) failed on frame 3: OSError: disk full"

@@ -1,0 +1,153 @@
+"""Camera and rotations against closed forms, OpenCV and SciPy."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import Rotation
+
+from mushpipe import Camera, quaternion_from_axis
+from mushpipe.core.geometry import brown, brown_inverse
+
+LENS = (0.12, -0.25, 0.001, -0.002, 0.09)
+SIZE = (640, 480, 617.0, 612.0, 322.5, 238.25)
+PINHOLE = Camera(*SIZE)
+BROWN = Camera(*SIZE, "brown_conrady", LENS)
+INVERSE = Camera(*SIZE, "inverse_brown_conrady", LENS)
+MATRIX = np.array([[617.0, 0, 322.5], [0, 612.0, 238.25], [0, 0, 1]])
+CAMERAS = {camera.model: camera for camera in (PINHOLE, BROWN, INVERSE)}
+
+inside = st.tuples(st.floats(0, 639), st.floats(0, 479))
+
+
+def points(n: int = 200) -> np.ndarray:
+    rng = np.random.default_rng(1)
+    z = rng.uniform(0.2, 2, n)
+    return np.stack([rng.uniform(-0.45, 0.45, n) * z, rng.uniform(-0.35, 0.35, n) * z, z], axis=1)
+
+
+def test_a_pinhole_by_hand():
+    np.testing.assert_allclose(PINHOLE.project([[0.1, -0.2, 0.5]]), [[445.9, -6.55]])
+    np.testing.assert_allclose(PINHOLE.deproject([[322.5, 238.25]], [0.7]), [[0, 0, 0.7]])
+    np.testing.assert_allclose(PINHOLE.deproject([[939.5, 238.25]], [2.0]), [[2, 0, 2]])
+
+
+@pytest.mark.parametrize(("camera", "coefficients"), [(PINHOLE, None), (BROWN, np.array(LENS))])
+def test_projection_agrees_with_opencv(camera, coefficients):
+    expected, _ = cv2.projectPoints(points(), np.zeros(3), np.zeros(3), MATRIX, coefficients)
+    np.testing.assert_allclose(camera.project(points()), expected[:, 0], atol=1e-9)
+
+
+def test_deprojection_agrees_with_opencv():
+    pixels = BROWN.project(points())
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 500, 1e-14)
+    rays = cv2.undistortPointsIter(
+        pixels[:, None], MATRIX, np.array(LENS), np.eye(3), np.eye(3), criteria
+    )[:, 0]
+    found = BROWN.deproject(pixels, np.ones(len(pixels)))
+    np.testing.assert_allclose(found[:, :2], rays, atol=1e-9)
+
+
+def test_the_inverse_model_is_the_forward_polynomial_on_the_way_out():
+    pixels = PINHOLE.project(points())
+    rays = (pixels - SIZE[4:]) / SIZE[2:4]
+    expected, _ = cv2.projectPoints(
+        np.c_[rays, np.ones(len(rays))], np.zeros(3), np.zeros(3), np.eye(3), np.array(LENS)
+    )
+    found = INVERSE.deproject(pixels, np.ones(len(pixels)))
+    np.testing.assert_allclose(found[:, :2], expected[:, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+@given(pixel=inside, depth=st.floats(0.1, 10))
+def test_there_and_back_again(camera, pixel, depth):
+    point = camera.deproject(np.array(pixel), np.array(depth))
+    assert point[2] == depth
+    np.testing.assert_allclose(camera.project(point), pixel, atol=1e-6)
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+def test_shapes_are_kept(camera):
+    grid = camera.deproject(np.full((4, 5, 2), 300.0), np.full((4, 5), 0.5))
+    assert grid.shape == (4, 5, 3)
+    assert camera.project(grid).shape == (4, 5, 2)
+    assert camera.project(np.zeros((0, 3))).shape == (0, 2)
+    assert camera.deproject(np.zeros((0, 2)), np.zeros(0)).shape == (0, 3)
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+def test_what_is_behind_the_camera_or_unknown_is_nan(camera):
+    behind = np.array([[0.1, 0.1, -1.0], [0.1, 0.1, 0.0], [np.nan, 0, 1], [0, 0, 1]])
+    assert np.isnan(camera.project(behind)).any(axis=1).tolist() == [True, True, True, False]
+    lifted = camera.deproject(np.array([[300.0, 200.0]]), np.array([np.nan]))
+    assert np.isnan(lifted).all()
+
+
+def test_a_ray_that_the_lens_cannot_have_is_nan():
+    # With k1 = -1 the radius r (1 - r^2) is nowhere above 2 / (3 sqrt 3) = 0.3849.
+    lens = (-1.0, 0.0, 0.0, 0.0, 0.0)
+    found = brown_inverse(np.array([[0.38, 0.0], [0.39, 0.0]]), lens)
+    radius = found[0, 0]
+    assert radius == pytest.approx(min(r.real for r in np.roots([-1, 0, 1, -0.38]) if r.real > 0))
+    assert np.isnan(found[1]).all()
+
+
+def test_the_polynomial_by_hand():
+    # x = 0.5, y = 0: r2 = 0.25
+    expected = 0.5 * (1 + 0.1 * 0.25 + 0.2 * 0.0625 + 0.5 * 0.015625) + 0.04 * 3 * 0.25
+    found = brown(np.array([0.5, 0.0]), (0.1, 0.2, 0.03, 0.04, 0.5))
+    np.testing.assert_allclose(found, [expected, 0.03 * 0.25], rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((0, 480, 1, 1, 0, 0), "size and focal length of a camera must be positive: Camera"),
+        ((640, 480, 0, 1, 0, 0), "size and focal length of a camera must be positive: Camera"),
+        (
+            (640, 480, np.nan, 1, 0, 0),
+            "size and focal length of a camera must be positive: Camera",
+        ),
+        ((*SIZE, "brown_conrady"), "camera model 'brown_conrady' with 0 coefficients; expected"),
+        ((*SIZE, "none", LENS), "camera model 'none' with 5 coefficients; expected none, or"),
+        ((*SIZE, "fisheye", LENS), "camera model 'fisheye' with 5 coefficients; expected none"),
+    ],
+)
+def test_a_camera_that_cannot_be(arguments, message):
+    with pytest.raises(ValueError) as caught:  # noqa: PT011 - the message is compared
+        Camera(*arguments)
+    assert str(caught.value).startswith(message)
+
+
+@given(arrays(np.float64, (7, 3), elements=st.floats(-1, 1)))
+def test_quaternions_take_z_to_the_axis_without_spin(vectors):
+    length = np.linalg.norm(vectors, axis=1)
+    axis = vectors[length > 1e-3] / length[length > 1e-3, None]
+    quaternion = quaternion_from_axis(axis)
+    np.testing.assert_allclose(np.linalg.norm(quaternion, axis=1), 1, atol=1e-12)
+    for q, a in zip(quaternion, axis, strict=True):
+        rotation = Rotation.from_quat(q)
+        # An axis within 1e-6 of -z is taken for -z itself.
+        np.testing.assert_allclose(rotation.apply([0, 0, 1]), a, atol=3e-6)
+        # The shortest rotation turns by the angle between the axes.
+        angle = np.arctan2(np.hypot(a[0], a[1]), a[2])
+        assert rotation.magnitude() == pytest.approx(angle, abs=3e-6)
+    assert (quaternion[:, 2:] >= [0, 0]).all()
+    assert (quaternion[:, 2] == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("axis", "quaternion"),
+    [
+        ([0, 0, 1], [0, 0, 0, 1]),
+        ([0, 0, -1], [1, 0, 0, 0]),
+        ([1, 0, 0], [0, np.sqrt(0.5), 0, np.sqrt(0.5)]),
+        ([0, 1, 0], [-np.sqrt(0.5), 0, 0, np.sqrt(0.5)]),
+        ([np.nan] * 3, [np.nan] * 4),
+    ],
+)
+def test_quaternions_by_hand(axis, quaternion):
+    found = quaternion_from_axis(np.array([axis], float))
+    np.testing.assert_allclose(found, [quaternion], atol=1e-15)

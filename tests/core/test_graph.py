@@ -1,0 +1,289 @@
+"""Compiling graph files: what a plan holds, and the words for every kind of fault."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mushpipe.core.document import parse_document
+from mushpipe.core.errors import GraphError
+from mushpipe.core.graph import compile_document
+from mushpipe.core.plugins import load_registry
+from tests.core.lab import Lab, cli
+
+KEYS = st.sampled_from(
+    ["use", "inputs", "level", "band", "delivery", "source", "stages", "sinks", "a", "b", "seed"]
+)
+
+GOOD = """
+mushpipe: 1
+description: a test
+seed: 3
+on_error: skip
+max_failures: 2
+source: {use: frames, count: 5}
+stages:
+  segment: {use: threshold, band: [1, 2]}
+  measure: {use: measure}
+sinks:
+  out: {use: collect, size: 0.5, delivery: latest}
+"""
+
+
+def test_a_good_graph_becomes_a_plan(lab: Lab):
+    plan = lab.compile(GOOD)
+    assert [node.name for node in plan.stages] == ["segment", "measure"]
+    assert plan.source.plugin.count == 5
+    assert plan.stages[0].plugin.band == (1, 2)
+    assert (plan.seed, plan.on_error, plan.max_failures) == (3, "skip", 2)
+    assert plan.sinks[0].delivery == "latest"
+    assert plan.warnings == ()
+    assert plan.replay()
+
+
+def test_a_resolved_graph_compiles_to_itself(lab: Lab):
+    resolved = lab.compile(GOOD).resolved()
+    assert resolved["stages"]["segment"] == {"use": "threshold", "level": 1, "band": [1, 2]}
+    assert lab.compile(yaml.safe_dump(resolved, sort_keys=False)).resolved() == resolved
+
+
+def stage(text: str) -> str:
+    return f"mushpipe: 1\nsource: {{use: frames}}\nstages:\n  seg: {text}\n"
+
+
+FAULTS = {
+    "unknown plugin": (
+        stage("{use: treshold}"),
+        """graph.yaml:4:14: unknown stage 'treshold'; did you mean 'threshold'?
+      seg: {use: treshold}
+                 ^""",
+    ),
+    "unknown plugin, nothing near": (
+        "mushpipe: 1\nsource: {use: zzz}\n",
+        """graph.yaml:2:15: unknown source 'zzz'; known: frames
+    source: {use: zzz}
+                  ^""",
+    ),
+    "a plugin of another kind": (
+        stage("{use: collect}"),
+        """graph.yaml:4:14: 'collect' is a sink, not a stage
+      seg: {use: collect}
+                 ^""",
+    ),
+    "misspelt setting": (
+        stage("{use: threshold, levle: 3}"),
+        """graph.yaml:4:25: unknown setting 'levle' of 'threshold'
+      seg: {use: threshold, levle: 3}
+                            ^
+    did you mean 'level'?""",
+    ),
+    "wrong type": (
+        stage("{use: threshold, level: high}"),
+        """graph.yaml:4:32: level of 'threshold': Input should be a valid integer, got "high"
+      seg: {use: threshold, level: high}
+                                   ^""",
+    ),
+    "a number in quotes": (
+        stage("{use: threshold, level: '3'}"),
+        """graph.yaml:4:32: level of 'threshold': Input should be a valid integer, got "3"
+      seg: {use: threshold, level: '3'}
+                                   ^""",
+    ),
+    "out of bounds": (
+        stage("{use: threshold, level: 300}"),
+        """graph.yaml:4:32: level of 'threshold': Input should be less than or equal to 255, got 300
+      seg: {use: threshold, level: 300}
+                                   ^""",
+    ),
+    "not finite": (
+        "mushpipe: 1\nsource: {use: frames, speed: .inf}\n",
+        """graph.yaml:2:30: speed of 'frames': Input should be a finite number, got Infinity
+    source: {use: frames, speed: .inf}
+                                 ^""",
+    ),
+    "inside a list": (
+        stage("{use: threshold, band: [1, x]}"),
+        """graph.yaml:4:35: band.1 of 'threshold': Input should be a valid integer, got "x"
+      seg: {use: threshold, band: [1, x]}
+                                      ^""",
+    ),
+    "no use": (
+        stage("{level: 3}"),
+        """graph.yaml:4:3: needs 'use': the name of a stage
+      seg: {level: 3}
+      ^""",
+    ),
+    "an entry that is no mapping": (
+        stage("threshold"),
+        """graph.yaml:4:8: stages.seg: Input should be an object, got "threshold"
+      seg: threshold
+           ^""",
+    ),
+    "inputs that are no mapping": (
+        stage("{use: threshold, inputs: source}"),
+        """graph.yaml:4:33: expected {parameter: stage name}
+      seg: {use: threshold, inputs: source}
+                                    ^""",
+    ),
+    "delivery of a stage": (
+        stage("{use: threshold, delivery: latest}"),
+        """graph.yaml:4:35: expected 'every' or 'latest', on a sink
+      seg: {use: threshold, delivery: latest}
+                                      ^""",
+    ),
+    "unknown delivery": (
+        "mushpipe: 1\nsource: {use: frames}\nsinks: {out: {use: collect, delivery: some}}\n",
+        """graph.yaml:3:39: expected 'every' or 'latest', on a sink
+    sinks: {out: {use: collect, delivery: some}}
+                                          ^""",
+    ),
+    "unknown key": (
+        "mushpipe: 1\nsorce: {use: frames}\nsource: {use: frames}\n",
+        """graph.yaml:2:1: unknown setting 'sorce'
+    sorce: {use: frames}
+    ^
+    did you mean 'source'?""",
+    ),
+    "missing keys": (
+        "stages: {}\n",
+        """graph.yaml:1:1: setting 'mushpipe' is missing
+    stages: {}
+    ^
+graph.yaml:1:1: setting 'source' is missing
+    stages: {}
+    ^""",
+    ),
+    "another version": (
+        "mushpipe: 2\nsource: {use: frames}\n",
+        """graph.yaml:1:11: mushpipe: Input should be 1, got 2
+    mushpipe: 2
+              ^""",
+    ),
+    "a name with a space": (
+        "mushpipe: 1\nsource: {use: frames}\nsinks: {my out: {use: collect}}\n",
+        """graph.yaml:3:9: 'my out' is no name: letters, digits, - and _, beginning with a letter
+    sinks: {my out: {use: collect}}
+            ^""",
+    ),
+    "a name that is a key": (
+        "mushpipe: 1\nsource: {use: frames}\nsinks: {seed: {use: collect}}\n",
+        """graph.yaml:3:9: 'seed' is a key of the graph file and cannot name a stage or sink
+    sinks: {seed: {use: collect}}
+            ^""",
+    ),
+    "a sink with the name of a stage": (
+        stage("{use: threshold}") + "sinks: {seg: {use: collect}}\n",
+        """graph.yaml:5:9: a stage is called 'seg' already
+    sinks: {seg: {use: collect}}
+            ^""",
+    ),
+}
+
+
+@pytest.mark.parametrize(("text", "expected"), FAULTS.values(), ids=FAULTS)
+def test_a_fault_is_placed_and_explained(lab: Lab, text: str, expected: str):
+    assert lab.faults(text) == expected
+
+
+@pytest.mark.parametrize(("text", "expected"), FAULTS.values(), ids=FAULTS)
+def test_the_program_prints_the_fault_and_ends_with_2(
+    lab: Lab, monkeypatch, capsys, text: str, expected: str
+):
+    monkeypatch.chdir(lab.folder)
+    monkeypatch.setattr("mushpipe.core.plugins.load_registry", lambda: lab.registry)
+    (lab.folder / "graph.yaml").write_text(text)
+    assert cli(monkeypatch, "validate", "graph.yaml") == 2
+    assert capsys.readouterr() == ("", f"error: {expected}\n")
+
+
+def test_a_missing_graph_file(lab: Lab, monkeypatch, capsys):
+    assert cli(monkeypatch, "run", lab.folder / "no.yaml") == 2
+    assert capsys.readouterr().err == f"error: {lab.folder}/no.yaml: there is no such file\n"
+
+
+def test_all_faults_are_reported_together_in_file_order(lab: Lab):
+    text = lab.faults("""
+        mushpipe: 1
+        source: {use: frame}
+        stages:
+          a: {use: threshold, level: x, levl: 2}
+          b: {use: nothing-like-it}
+          c: {use: invert, inputs: 3}
+        sinks:
+          out: {use: collect, size: -1}
+          a: {use: collect}
+    """)
+    places = [line.split(": ")[0] for line in text.splitlines() if line.startswith("graph.yaml")]
+    assert places == [
+        f"graph.yaml:{place}" for place in ["2:15", "4:30", "4:33", "5:12", "6:28", "8:29", "9:3"]
+    ]
+
+
+def test_a_missing_setting_is_placed_at_its_plugin(lab: Lab):
+    from mushpipe import Sink
+
+    class Needy(Sink):
+        size: int
+
+        def consume(self) -> None:
+            """Take nothing."""
+
+    lab.registry.sink("needy", Needy)
+    assert lab.faults("mushpipe: 1\nsource: {use: frames}\nsinks:\n  out: {use: needy}\n") == (
+        "graph.yaml:4:8: setting 'size' of 'needy' is missing\n"
+        "      out: {use: needy}\n"
+        "           ^"
+    )
+
+
+trees = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.sampled_from(["a", "threshold"]),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(KEYS, inner, max_size=4),
+    max_leaves=6,
+)
+
+
+@given(st.dictionaries(KEYS, trees), st.sampled_from(["", "a.use=both", "a.level=2", "seed.x=1"]))
+def test_any_data_are_a_plan_or_a_graph_error(data, override):
+    lab = Lab(Path("/graphs"))
+    text = yaml.safe_dump({"mushpipe": 1, "source": {"use": "frames"}, **data})
+    try:
+        plan = lab.compile(text, *filter(None, [override]))
+    except GraphError as error:
+        assert error.problems  # noqa: PT017 - a plan is as good
+    else:
+        assert lab.compile(yaml.safe_dump(plan.resolved(), sort_keys=False))
+
+
+def test_settings_are_frozen(lab: Lab):
+    from pydantic import ValidationError
+
+    with pytest.raises(ValidationError, match="Instance is frozen"):
+        lab.compile(GOOD).stages[0].plugin.level = 4
+
+
+def test_paths_are_relative_to_the_graph_file_unless_the_shell_gives_them(lab: Lab):
+    lab.registry.source("mcap", "mushpipe.sources.mcap:McapSource")
+    graph = "mushpipe: 1\nsource: {use: mcap, path: ../bed.mcap}\n"
+    assert lab.compile(graph).source.plugin.path == lab.folder.parent / "bed.mcap"
+    given = lab.compile(graph, "source.path=sub/../bed.mcap").source.plugin.path
+    assert str(given) == "bed.mcap"
+    absolute = lab.compile(graph, "source.path=/data/bed.mcap").source.plugin.path
+    assert str(absolute) == "/data/bed.mcap"
+
+
+def test_a_fault_at_the_top_does_not_hide_the_faults_below() -> None:
+    text = (
+        "mushpipe: 1\nsede: 3\nsource: {use: synthetic, cuont: 3}\n"
+        "stages:\n  a: {use: otsu, x: 1}\n"
+    )
+    with pytest.raises(GraphError) as caught:
+        compile_document(parse_document(text, "g.yaml", Path()), load_registry())
+    assert [p.line for p in caught.value.problems] == [2, 3, 5]
+
+
+def test_numbers_may_be_written_as_powers_of_ten() -> None:
+    data = parse_document("a: 1e-3\nb: -2E+4\nc: 1.5e3\nd: 1e\n", "g.yaml", Path()).data
+    assert data == {"a": 1e-3, "b": -2e4, "c": 1.5e3, "d": "1e"}

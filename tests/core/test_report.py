@@ -1,0 +1,179 @@
+"""The report's arithmetic and the manifest."""
+
+import hashlib
+import json
+import math
+import platform
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mushpipe import RunInfo, Sink, Trace
+from mushpipe.core.errors import InputError
+from mushpipe.core.manifest import build_manifest, manifest_path
+from mushpipe.core.report import Durations, RunReport, SinkReport
+from tests.core.lab import Frames, Lab, cli
+
+
+@given(
+    st.lists(st.integers(1, 10**11), min_size=1, max_size=200),
+    st.sampled_from([0.0, 0.25, 0.5, 0.95, 1.0]),
+)
+def test_quantiles_are_those_of_numpy_within_one_percent(values, q):
+    durations = Durations()
+    for value in values:
+        durations.add(value)
+    expected = np.quantile(values, q, method="lower") / 1e6
+    assert durations.quantile_ms(q) == pytest.approx(expected, rel=0.01)
+    assert durations.summary()["max_ms"] == round(max(values) / 1e6, 3)
+    assert durations.count == len(values)
+
+
+def test_no_durations_have_no_quantile():
+    assert math.isnan(Durations().quantile_ms(0.5))
+
+
+def test_a_duration_of_nothing_counts():
+    durations = Durations()
+    durations.add(0)
+    assert durations.summary() == {"p50_ms": 0, "p95_ms": 0, "max_ms": 0}
+
+
+@pytest.mark.parametrize(
+    ("report", "balanced", "exit_code"),
+    [
+        (RunReport(read=7, waiting=2, processed=3, dropped=1, failed=1), True, 0),
+        (RunReport(read=7, waiting=2, processed=3, dropped=1), False, 1),
+        (RunReport(interrupted=True), True, 130),
+        (RunReport(interrupted=True, error=InputError("x")), True, 4),
+        (RunReport(read=1), False, 1),
+        (RunReport(sinks={"a": SinkReport(3, 1, 1, 1)}), True, 0),
+        (RunReport(sinks={"a": SinkReport(3, 1, 1, 0)}), False, 1),
+    ],
+)
+def test_the_balance_decides_the_exit_code(report, balanced, exit_code):
+    assert (report.balanced(), report.exit_code) == (balanced, exit_code)
+
+
+def test_the_summary_is_plain_data():
+    report = RunReport(
+        read=5,
+        waiting=1,
+        processed=2,
+        dropped=1,
+        failed=1,
+        source={"lost": 1},
+        sinks={"out": SinkReport(2, 2)},
+        durations={"a": Durations()},
+        elapsed_s=1.23456,
+        error=InputError("bad"),
+        capsules=["c.mcap"],
+    )
+    report.durations["a"].add(2_000_000)
+    # Through JSON and back, as it is stored.
+    assert json.loads(json.dumps(report.summary())) == {
+        "exit_code": 4,
+        "error": "bad",
+        "frames": {"in": 4, "processed": 2, "dropped": 1, "failed": 1, "balanced": True},
+        "source": {"lost": 1},
+        "sinks": {"out": {"handed": 2, "consumed": 2, "dropped": 0, "failed": 0}},
+        "stages": {"a": {"p50_ms": 2.0, "p95_ms": 2.0, "max_ms": 2.0}},
+        "elapsed_s": 1.235,
+        "capsules": ["c.mcap"],
+    }
+
+
+class Recorded(Frames):
+    """Frames that come from files."""
+
+    path: Path = Path("none")
+
+    def name(self) -> str:
+        return "bed"
+
+    def files(self) -> tuple[Path, ...]:
+        return (self.path, Path("/no/such.mcap"))
+
+
+class Writes(Sink):
+    path: Path = Path("{recording}.out")
+
+    def consume(self, trace: Trace) -> None: ...
+
+    def files(self, run: RunInfo) -> tuple[Path, ...]:
+        return (run.path(self.path),)
+
+
+@pytest.fixture
+def graph(lab: Lab) -> str:
+    lab.registry.source("recorded", Recorded)
+    lab.registry.sink("writes", Writes)
+    return lab.chain("dice", source="recorded", extra="seed: 9")
+
+
+def test_the_manifest_says_what_a_run_was_made_of(lab: Lab, graph: str):
+    recording = lab.folder / "bed.mcap"
+    recording.write_bytes(b"mushrooms")
+    manifest = build_manifest(lab.compile(graph, f"source.path={recording}"))
+    assert manifest["graph_file"] == "graph.yaml"
+    assert manifest["seed"] == 9
+    assert manifest["overrides"] == [f"--set source.path={recording}"]
+    assert manifest["recordings"] == [
+        {
+            "file": "bed.mcap",
+            "sha256": hashlib.sha256(b"mushrooms").hexdigest(),
+            "bytes": 9,
+        },
+        {"file": "such.mcap", "sha256": None, "bytes": None},
+    ]
+    assert manifest["versions"]["python"] == platform.python_version()
+    assert manifest["versions"]["numpy"] == version("numpy") == np.__version__
+    assert manifest["graph"]["stages"] == {"a": {"use": "dice"}}
+    assert manifest["graph"]["source"]["path"] == str(recording)
+    assert json.loads(json.dumps(manifest)) == manifest
+
+
+def test_the_resolved_graph_writes_out_inputs_and_delivery(lab: Lab):
+    plan = lab.compile("""
+        mushpipe: 1
+        source: {use: frames}
+        stages: {a: {use: threshold, inputs: {frame: source}}}
+        sinks: {out: {use: collect, delivery: every}}
+    """)
+    graph = build_manifest(plan)["graph"]
+    assert graph["stages"]["a"]["inputs"] == {"frame": "source"}
+    assert graph["sinks"]["out"]["delivery"] == "every"
+    assert graph["source"] == {"use": "frames", "max_frames": None, "speed": 0.0, "count": 3}
+
+
+def test_the_manifest_stands_beside_the_first_result(lab: Lab, graph: str):
+    assert manifest_path(lab.compile(graph)) == Path("run.json")
+    wanted = lab.folder / "deep" / "{recording}.results.mcap"
+    plan = lab.compile(graph.replace("collect", "writes"), f"out.path={wanted}")
+    assert manifest_path(plan) == lab.folder / "deep" / "bed.results.run.json"
+    assert (lab.folder / "deep").is_dir()
+
+
+def test_the_program_writes_manifest_and_result(lab: Lab, graph: str, monkeypatch):
+    monkeypatch.chdir(lab.folder)
+    monkeypatch.setattr("mushpipe.core.plugins.load_registry", lambda: lab.registry)
+    (lab.folder / "graph.yaml").write_text(graph)
+    assert cli(monkeypatch, "run", "graph.yaml", "--manifest", "sub/m.json", "--frames", "2") == 0
+    content = json.loads((lab.folder / "sub" / "m.json").read_text())
+    assert content["overrides"] == ["--frames 2"]
+    assert content["result"]["frames"] == {
+        "in": 2,
+        "processed": 2,
+        "dropped": 0,
+        "failed": 0,
+        "balanced": True,
+    }
+
+
+def test_a_source_has_a_name_and_no_files_unless_it_says_so():
+    source = Frames()
+    assert (source.name(), source.files(), source.counts()) == ("frames", (), {})

@@ -1,0 +1,201 @@
+"""The per-mushroom types: shapes, lengths, dtypes, and values that contradict each other."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from mushpipe import Circles, Columns, DepthSource, Locations, PickFlag, Picks, Poses, column
+from mushpipe.core.tables import locked
+from mushpipe.core.truth import Ignore, Instances, Truth
+
+NAN = np.nan
+
+
+def circles(**changes):
+    values = {"center": [[1, 2], [3, 4]], "radius": [5, 6], "score": [0, 1]}
+    return Circles(**{**values, **changes})
+
+
+def locations(**changes):
+    values = {
+        "position": [[0, 0, 1], [NAN] * 3],
+        "distance": [1, NAN],
+        "diameter": [0.05, NAN],
+        "source": [DepthSource.MEASURED, DepthSource.MISSING],
+        "sigma_position": np.full((2, 3), NAN),
+        "sigma_diameter": [NAN, NAN],
+    }
+    return Locations(**{**values, **changes})
+
+
+def poses(**changes):
+    values = {
+        "quaternion": [[0, 0, 0, 1], [NAN] * 4],
+        "axis": [[0, 0, 1], [NAN] * 3],
+        "apex": [[0, 0, 1], [NAN] * 3],
+        "sigma_rad": [0.1, NAN],
+        "fitness": [1, NAN],
+        "valid": [True, False],
+    }
+    return Poses(**{**values, **changes})
+
+
+def picks(**changes):
+    values = {
+        "id": [7, 8],
+        "center": np.zeros((2, 2)),
+        "radius": [1, 1],
+        "position": [[0, 0, 1], [NAN] * 3],
+        "distance": [1, NAN],
+        "diameter": [0.1, NAN],
+        "quaternion": np.full((2, 4), NAN),
+        "axis": np.full((2, 3), NAN),
+        "score": [1, 1],
+        "sigma_position": np.full((2, 3), NAN),
+        "sigma_diameter": [NAN, NAN],
+        "sigma_tilt": [NAN, NAN],
+        "source": [DepthSource.NEIGHBOURS, DepthSource.MISSING],
+        "flags": [PickFlag.DEPTH_ESTIMATED, PickFlag.DEPTH_MISSING],
+        "frame_id": "camera",
+    }
+    return Picks(**{**values, **changes})
+
+
+def truth(**changes):
+    values = {
+        "id": [0, 1],
+        "center": np.zeros((2, 2)),
+        "radius": [5, 5],
+        "visible": [0, NAN],
+        "apex": np.full((2, 3), NAN),
+        "surface": np.full((2, 3), NAN),
+        "axis": [[1, 0, 0], [NAN] * 3],
+        "diameter": [NAN, NAN],
+        "diameter_max": [NAN, NAN],
+        "ignore": [Ignore.COUNTS, Ignore.HIDDEN],
+    }
+    return Truth(**{**values, **changes})
+
+
+@pytest.mark.parametrize("make", [circles, locations, poses, picks, truth])
+def test_good_rows_are_kept_and_locked(make):
+    table = make()
+    assert len(table) == 2
+    for name, value in vars(table).items():
+        if isinstance(value, np.ndarray):
+            assert value.flags.c_contiguous
+            with pytest.raises(ValueError, match="read-only"):
+                value[0] = 0
+            with pytest.raises(AttributeError):
+                setattr(table, name, value)
+
+
+def test_dtypes_are_converted():
+    table = picks()
+    assert (table.id.dtype, table.flags.dtype, table.source.dtype) == ("int64", "uint32", "uint8")
+    assert poses().valid.dtype == bool
+    assert circles().radius.dtype == np.float64
+
+
+WRONG = [
+    (circles, {"center": [1, 2]}, "Circles.center has shape (2,), expected (N, 2)"),
+    (circles, {"center": np.zeros((2, 3))}, "Circles.center has shape (2, 3), expected (N, 2)"),
+    (circles, {"radius": [[5], [6]]}, "Circles.radius has shape (2, 1), expected (N,)"),
+    (circles, {"radius": [5]}, "Circles.radius has 1 rows, expected 2"),
+    (circles, {"center": [[1, 2], [NAN, 0]]}, "Circles: the centre must be finite (row 1)"),
+    (circles, {"radius": [0, 1]}, "Circles: the radius must be positive (row 0)"),
+    (circles, {"radius": [1, np.inf]}, "Circles: the radius must be positive (row 1)"),
+    (circles, {"score": [1.1, 1]}, "Circles: the score must be within 0..1 (row 0)"),
+    (circles, {"score": [1, NAN]}, "Circles: the score must be within 0..1 (row 1)"),
+    (
+        locations,
+        {"position": np.ones((2, 3))},
+        "Locations: position must be NaN where missing (row 1)",
+    ),
+    (locations, {"distance": [NAN, NAN]}, "Locations: distance must be NaN where missing (row 0)"),
+    (locations, {"diameter": [0, NAN]}, "Locations: the diameter must be positive or NaN (row 0)"),
+    (
+        poses,
+        {"valid": [True, True]},
+        "Poses: quaternion must be finite exactly where valid (row 1)",
+    ),
+    (
+        poses,
+        {"axis": [[0, 0, 1], [0, 0, 1]]},
+        "Poses: axis must be finite exactly where valid (row 1)",
+    ),
+    (
+        poses,
+        {"quaternion": [[0, 0, 0, 2], [NAN] * 4]},
+        "Poses: quaternion must have length 1 (row 0)",
+    ),
+    (poses, {"axis": [[0, 1, 1], [NAN] * 3]}, "Poses: axis must have length 1 (row 0)"),
+    (picks, {"id": [7, 7]}, "Picks: ids must be unique (row 0)"),
+    (picks, {"position": np.ones((2, 3))}, "Picks: position must be NaN where missing (row 1)"),
+    (picks, {"flags": [0, 0]}, "Picks: DEPTH_MISSING must be set exactly where missing (row 1)"),
+    (picks, {"flags": [1, 1]}, "Picks: DEPTH_MISSING must be set exactly where missing (row 0)"),
+    (truth, {"id": [1, 1]}, "Truth: ids must be unique (row 0)"),
+    (truth, {"center": np.full((2, 2), NAN)}, "Truth: the centre must be finite (row 0)"),
+    (truth, {"radius": [1, NAN]}, "Truth: the radius must be positive (row 1)"),
+    (truth, {"visible": [2, 0]}, "Truth: visible must be within 0..1 (row 0)"),
+    (truth, {"axis": [[1, 1, 0], [NAN] * 3]}, "Truth: axis must have length 1 (row 0)"),
+]
+
+
+@pytest.mark.parametrize(("make", "changes", "message"), WRONG)
+def test_what_cannot_be_is_refused(make, changes, message):
+    with pytest.raises(ValueError) as caught:  # noqa: PT011 - the whole message is compared
+        make(**changes)
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize("cls", [Circles, Locations, Poses, Picks, Truth])
+def test_a_table_may_have_no_rows(cls):
+    from dataclasses import fields
+
+    empty = {f.name: np.zeros((0, *f.metadata["shape"])) for f in fields(cls) if f.metadata}
+    assert len(cls(**empty)) == 0
+
+
+def test_columns_of_ones_own():
+    @dataclass(frozen=True, eq=False)
+    class Sizes(Columns):
+        note: str
+        box: np.ndarray = column(2, 2, dtype=np.float32)
+
+    sizes = Sizes("x", np.zeros((3, 2, 2)))
+    assert (len(sizes), sizes.box.dtype) == (3, np.float32)
+    with pytest.raises(ValueError, match=r"^Sizes\.box has shape \(2, 2\), expected \(N, 2, 2\)$"):
+        Sizes("x", np.zeros((2, 2)))
+
+
+@given(arrays(np.float64, st.tuples(st.integers(0, 5), st.just(2))))
+def test_any_finite_circles_are_taken_and_no_others(center):
+    n = len(center)
+    if np.isfinite(center).all():
+        assert np.array_equal(Circles(center, np.ones(n), np.zeros(n)).center, center)
+    else:
+        with pytest.raises(ValueError, match="the centre must be finite"):
+            Circles(center, np.ones(n), np.zeros(n))
+
+
+def test_locked_keeps_what_fits_and_copies_what_does_not():
+    array = np.arange(6.0).reshape(2, 3)
+    assert locked(array, np.float64) is array
+    assert not array.flags.writeable
+    turned = locked(array.T, np.float64)
+    assert turned.flags.c_contiguous
+    assert np.array_equal(turned, array.T)
+    assert locked([1, 2], np.uint8).dtype == np.uint8
+
+
+def test_instances():
+    labels = np.zeros((2, 3), np.uint16)
+    assert not Instances(labels).labels.flags.writeable
+    for bad in (labels.astype(np.int32), labels[0]):
+        with pytest.raises(ValueError, match=r"^Instances\.labels is .*, expected uint16$"):
+            Instances(bad)

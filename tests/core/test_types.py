@@ -1,0 +1,109 @@
+"""Frames and masks: what they check, what they compute."""
+
+import numpy as np
+import pytest
+
+from mushpipe import Camera, Header, Mask, RgbdFrame
+from tests.core.lab import make_frame
+
+COLOR = np.zeros((4, 6, 3), np.uint8)
+HEADER = Header(5, 0, "camera")
+
+
+def test_arrival_is_the_stamp_where_it_is_not_known():
+    assert Header(5, 0, "c").arrival_ns == 5
+    assert Header(5, 0, "c", 9).arrival_ns == 9
+
+
+def test_a_frame_is_locked():
+    frame = RgbdFrame(HEADER, COLOR.copy(), np.ones((4, 6), np.uint16))
+    for array in (frame.color, frame.depth, frame.gray, frame.depth_m):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0, 0] = 1
+    with pytest.raises(AttributeError):
+        frame.depth = None
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"color": COLOR[..., 0]}, "color is uint8(4, 6), expected uint8 (H, W, 3)"),
+        ({"color": COLOR.astype(float)}, "color is float64(4, 6, 3), expected uint8 (H, W, 3)"),
+        (
+            {"color": np.zeros((4, 6, 4), np.uint8)},
+            "color is uint8(4, 6, 4), expected uint8 (H, W, 3)",
+        ),
+        ({"color": COLOR[:0]}, "color is uint8(0, 6, 3), expected uint8 (H, W, 3)"),
+        ({"depth": np.zeros((4, 6))}, "depth is float64, expected uint16 or float32"),
+        (
+            {"depth": np.zeros((2, 3), np.uint16)},
+            "depth has shape (2, 3), colour (4, 6): depth must be aligned to colour",
+        ),
+        (
+            {"depth": np.zeros((4, 6), np.uint16), "depth_scale": 0},
+            "depth_scale is 0, expected metres per unit > 0",
+        ),
+        (
+            {"camera": Camera(64, 48, 1, 1, 0, 0)},
+            "the image is 6x4, its calibration is for 64x48",
+        ),
+    ],
+)
+def test_a_frame_that_cannot_be(changes, message):
+    with pytest.raises(ValueError) as caught:  # noqa: PT011 - the whole message is compared
+        RgbdFrame(**{"header": HEADER, "color": COLOR, **changes})
+    assert str(caught.value) == message
+
+
+def test_depth_in_metres_from_sensor_units():
+    native = np.array([[0, 1, 8000, 65535]], np.uint16)
+    frame = RgbdFrame(HEADER, np.zeros((1, 4, 3), np.uint8), native, 0.000125)
+    expected = [np.nan, 0.000125, 1.0, 8.191875]
+    assert frame.depth_m.dtype == np.float32
+    np.testing.assert_allclose(frame.depth_m[0], expected, rtol=1e-6)
+
+
+def test_depth_in_metres_from_floats_keeps_no_nonsense():
+    native = np.array([[0, -1, np.nan, np.inf, 0.5]], np.float32)
+    frame = RgbdFrame(HEADER, np.zeros((1, 5, 3), np.uint8), native, 1.0)
+    np.testing.assert_array_equal(frame.depth_m[0], [np.nan] * 4 + [0.5])
+
+
+def test_a_frame_without_depth_has_none_anywhere():
+    depth = make_frame().depth_m
+    assert depth.shape == (6, 8)
+    assert np.isnan(depth).all()
+
+
+def test_gray_is_the_luma_of_bt_601():
+    color = np.random.default_rng(0).integers(0, 256, (5, 7, 3), np.uint8)
+    gray = RgbdFrame(HEADER, color).gray
+    assert gray.dtype == np.float32
+    # OpenCV rounds to whole gray levels.
+    np.testing.assert_allclose(gray * 255, color @ [0.299, 0.587, 0.114], atol=0.51)
+    assert RgbdFrame(HEADER, np.full((1, 1, 3), 255, np.uint8)).gray[0, 0] == 1
+
+
+def test_a_mask_is_locked():
+    mask = Mask(np.zeros((2, 3), bool), np.ones((2, 3), bool))
+    assert not mask.foreground.flags.writeable
+    assert not mask.initial.flags.writeable
+    assert Mask(np.zeros((2, 3), bool)).initial is None
+
+
+@pytest.mark.parametrize(
+    ("foreground", "initial", "message"),
+    [
+        (np.zeros((2, 3), np.uint8), None, "Mask.foreground is uint8(2, 3), expected bool (H, W)"),
+        (np.zeros(3, bool), None, "Mask.foreground has 1 dimensions, expected 2"),
+        (
+            np.zeros((2, 3), bool),
+            np.zeros((3, 2), bool),
+            "Mask.initial is bool(3, 2), expected bool (H, W)",
+        ),
+    ],
+)
+def test_a_mask_that_cannot_be(foreground, initial, message):
+    with pytest.raises(ValueError) as caught:  # noqa: PT011 - the whole message is compared
+        Mask(foreground, initial)
+    assert str(caught.value) == message

@@ -1,0 +1,284 @@
+"""Ports read from signatures, and who feeds whom."""
+
+import typing
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mushpipe import Circles, Mask, Picks, RgbdFrame, Sink, Stage, Trace
+from mushpipe.core.errors import PluginError
+from mushpipe.core.plan import Link
+from mushpipe.core.stage import Port, Ports, ports_of
+from tests.core.lab import Both, Dice, Frames, Invert, Lab, cli
+
+
+def declared(process: Any) -> type[Stage]:
+    return type("Declared", (Stage,), {"process": process})
+
+
+def optional(self, frame: RgbdFrame, mask: Mask | None, circles: Circles | None = None) -> Mask:
+    return Mask(frame.gray > 0)
+
+
+def old_optional(self, mask: typing.Optional[Mask]) -> Mask:  # noqa: UP045
+    return Mask(~mask.foreground)
+
+
+@pytest.mark.parametrize(
+    ("plugin", "ports"),
+    [
+        (Invert, Ports((Port("mask", Mask, True),), (Mask,), False)),
+        (Both, Ports((Port("frame", RgbdFrame, True),), (Mask, Circles), False)),
+        (Dice, Ports((Port("frame", RgbdFrame, True),), (Circles,), True)),
+        (Frames, Ports((), (RgbdFrame,), False)),
+        (
+            declared(optional),
+            Ports(
+                (
+                    Port("frame", RgbdFrame, True),
+                    Port("mask", Mask, False),
+                    Port("circles", Circles, False),
+                ),
+                (Mask,),
+                False,
+            ),
+        ),
+        (declared(old_optional), Ports((Port("mask", Mask, False),), (Mask,), False)),
+    ],
+)
+def test_ports_are_read_from_the_signature(plugin, ports):
+    assert ports_of(plugin) == ports
+
+
+def no_annotation(self, frame) -> Mask: ...
+def two_types(self, frame: RgbdFrame | Mask) -> Mask: ...
+def three_types(self, frame: RgbdFrame | Mask | None) -> Mask: ...
+def starred(self, *frames: RgbdFrame) -> Mask: ...
+def keyword_only(self, *, frame: RgbdFrame) -> Mask: ...
+def no_return(self, frame: RgbdFrame): ...
+def none_return(self, frame: RgbdFrame) -> None: ...
+def optional_return(self, frame: RgbdFrame) -> Mask | None: ...
+def any_number(self, frame: RgbdFrame) -> tuple[Mask, ...]: ...
+def twice(self, frame: RgbdFrame) -> tuple[Mask, Mask]: ...
+def unknown(self, frame: "Frame") -> Mask: ...  # noqa: F821
+def unknown_part(self, frame: "np.no_such_thing") -> Mask: ...
+
+
+RETURNS = "Declared.process must be annotated with what it returns: a type, or a tuple of types"
+
+
+@pytest.mark.parametrize(
+    ("process", "message"),
+    [
+        (no_annotation, "Declared: parameter 'frame' must be annotated with one type"),
+        (two_types, "Declared: parameter 'frame' must be annotated with one type"),
+        (three_types, "Declared: parameter 'frame' must be annotated with one type"),
+        (starred, "Declared: parameter 'frames' must be annotated with one type"),
+        (keyword_only, "Declared: parameter 'frame' must be annotated with one type"),
+        (no_return, RETURNS),
+        (none_return, RETURNS),
+        (optional_return, RETURNS),
+        (any_number, RETURNS),
+        (twice, "Declared.process returns the same type twice"),
+        (unknown, "Declared.process: unknown annotation: name 'Frame' is not defined"),
+        (unknown_part, "Declared.process: unknown annotation: module 'numpy' has no attribute"),
+    ],
+)
+def test_a_signature_that_says_too_little(lab: Lab, process, message):
+    lab.registry.stage("declared", declared(process))
+    fault = lab.faults("mushpipe: 1\nsource: {use: frames}\nstages:\n  a: {use: declared}\n")
+    assert fault.startswith(f"graph.yaml:4:12: {message}")
+
+
+def test_a_plugin_without_its_method():
+    with pytest.raises(PluginError, match=r"^Stage has no method 'process'$"):
+        ports_of(Stage)
+    with pytest.raises(PluginError, match=r"^Sink has no method 'consume'$"):
+        ports_of(Sink)
+
+
+def links(lab: Lab, text: str) -> dict[str, dict[str, Link]]:
+    plan = lab.compile(text)
+    return {node.name: node.links for node in (*plan.stages, *plan.sinks)}
+
+
+def test_an_input_takes_the_nearest_producer_above_it_through_filters(lab: Lab):
+    found = links(lab, lab.chain("brighten", "threshold", "invert", "brighten", "measure"))
+    assert found == {
+        "a": {"frame": Link("source", 0)},
+        "b": {"frame": Link("a", 0)},
+        "c": {"mask": Link("b", 0)},
+        "d": {"frame": Link("a", 0)},
+        "e": {"frame": Link("d", 0), "mask": Link("c", 0)},
+        "out": {},
+    }
+
+
+def test_filters_change_what_stages_below_them_see(lab: Lab):
+    lab.run(lab.chain("threshold", "invert", "brighten", "measure"))
+    # Gray levels 0, 1, 2 plus 100; the inverted mask of level >= 1 is full only for frame 0.
+    assert [list(trace.outputs["d"][0].center[0]) for trace in lab.seen] == [
+        [100, 48],
+        [101, 0],
+        [102, 0],
+    ]
+
+
+def test_inputs_name_another_producer(lab: Lab):
+    text = lab.chain("threshold", "invert").replace("sinks:", "  c: {use: measure, inputs: {I}}\n#")
+    assert links(lab, text.replace("{I}", "{mask: a, frame: source}"))["c"] == {
+        "frame": Link("source", 0),
+        "mask": Link("a", 0),
+    }
+
+
+def test_the_second_output_of_a_stage_is_wired(lab: Lab):
+    class Count(Sink):
+        def consume(self, circles: Circles) -> None: ...
+
+    lab.registry.sink("count", Count)
+    text = lab.chain("both").replace("collect", "count")
+    assert links(lab, text)["out"] == {"circles": Link("a", 1)}
+
+
+def test_a_subtype_serves_where_its_base_is_wanted(lab: Lab):
+    class FineMask(Mask): ...
+
+    class Fine(Stage):
+        def process(self, frame: RgbdFrame) -> FineMask: ...
+
+    assert links(lab, lab.chain(Fine, "invert"))["b"] == {"mask": Link("a", 0)}
+
+
+def test_an_optional_input_may_have_no_producer(lab: Lab):
+    found = links(lab, lab.chain(declared(optional), declared(optional)))
+    assert found["a"] == {"frame": Link("source", 0)}
+    assert found["b"] == {"frame": Link("source", 0), "mask": Link("a", 0)}
+
+
+FAULTS = {
+    "nobody produces it": (
+        "b: {use: invert}",
+        """graph.yaml:4:3: nothing above 'b' produces the Mask of its 'mask'
+      b: {use: invert}
+      ^
+    stages that produce Mask: both, invert, threshold""",
+    ),
+    "only below": (
+        "b: {use: measure}\n  c: {use: threshold}",
+        """graph.yaml:4:3: nothing above 'b' produces the Mask of its 'mask'
+      b: {use: measure}
+      ^
+    stages that produce Mask: both, invert, threshold""",
+    ),
+    "it feeds itself": (
+        "a: {use: threshold}\n  b: {use: invert, inputs: {mask: b}}",
+        """graph.yaml:5:35: a cycle: 'b' feeds itself
+      b: {use: invert, inputs: {mask: b}}
+                                      ^""",
+    ),
+    "a cycle": (
+        "a: {use: threshold}\n  b: {use: invert, inputs: {mask: c}}\n  c: {use: invert}",
+        """graph.yaml:5:35: a cycle: b -> c -> b; 'c' stands below 'b': the order of stages is the data flow
+      b: {use: invert, inputs: {mask: c}}
+                                      ^""",  # noqa: E501
+    ),
+    "a wider cycle": (
+        "b: {use: invert, inputs: {mask: d}}\n  c: {use: invert}\n"
+        "  d: {use: invert, inputs: {mask: c}}",
+        """graph.yaml:4:35: a cycle: b -> d -> b; 'd' stands below 'b': the order of stages is the data flow
+      b: {use: invert, inputs: {mask: d}}
+                                      ^""",  # noqa: E501
+    ),
+    "wrong order": (
+        "b: {use: invert, inputs: {mask: c}}\n  c: {use: threshold}",
+        """graph.yaml:4:35: 'c' stands below 'b': the order of stages is the data flow
+      b: {use: invert, inputs: {mask: c}}
+                                      ^""",
+    ),
+    "no such stage": (
+        "a: {use: threshold}\n  b: {use: invert, inputs: {mask: aa}}",
+        """graph.yaml:5:35: there is no stage 'aa'; did you mean 'a'?
+      b: {use: invert, inputs: {mask: aa}}
+                                      ^""",
+    ),
+    "the wrong type": (
+        "a: {use: threshold}\n  b: {use: invert, inputs: {mask: source}}",
+        """graph.yaml:5:35: 'source' does not produce Mask
+      b: {use: invert, inputs: {mask: source}}
+                                      ^""",
+    ),
+    "no such input": (
+        "a: {use: threshold, inputs: {frme: source}}",
+        """graph.yaml:4:32: 'threshold' has no input 'frme'
+      a: {use: threshold, inputs: {frme: source}}
+                                   ^
+    did you mean 'frame'?""",
+    ),
+}
+
+
+@pytest.mark.parametrize(("stages", "expected"), FAULTS.values(), ids=FAULTS)
+def test_an_input_that_cannot_be_wired(lab: Lab, stages, expected):
+    text = f"mushpipe: 1\nsource: {{use: frames}}\nstages:\n  {stages}\n"
+    assert lab.faults(text) == expected
+
+
+@pytest.mark.parametrize(("stages", "expected"), FAULTS.values(), ids=FAULTS)
+def test_the_program_prints_the_fault_and_ends_with_2(
+    lab: Lab, monkeypatch, capsys, stages, expected
+):
+    monkeypatch.chdir(lab.folder)
+    monkeypatch.setattr("mushpipe.core.plugins.load_registry", lambda: lab.registry)
+    text = f"mushpipe: 1\nsource: {{use: frames}}\nstages:\n  {stages}\n"
+    (lab.folder / "graph.yaml").write_text(text)
+    assert cli(monkeypatch, "run", "graph.yaml") == 2
+    assert capsys.readouterr() == ("", f"error: {expected}\n")
+
+
+def test_inputs_of_a_source_are_refused_in_their_place(lab: Lab):
+    fault = lab.faults("mushpipe: 1\nsource: {use: frames, inputs: {mask: a}}\n")
+    assert fault.startswith("graph.yaml:2:32: 'frames' has no input 'mask'\n")
+
+
+def test_all_inputs_that_cannot_be_wired_are_reported_together(lab: Lab):
+    text = lab.faults(lab.chain("measure", "invert"))
+    assert text.count("nothing above") == 2
+
+
+def test_a_type_that_no_plugin_produces(lab: Lab):
+    class Robot(Sink):
+        def consume(self, picks: Picks) -> None: ...
+
+    lab.registry.sink("robot", Robot)
+    lab.registry.stage("broken", "no_such_module:X")
+    text = "mushpipe: 1\nsource: {use: frames}\nsinks:\n  r: {use: robot}\n"
+    assert lab.faults(text).endswith("stages that produce Picks: none installed")
+
+
+def test_a_stage_that_lacks_its_library_does_not_hide_the_fault(lab: Lab, monkeypatch):
+    from mushpipe.core.errors import DependencyError
+    from mushpipe.core.plugins import Entry
+
+    def load(entry: Entry) -> type:
+        raise DependencyError("no libGL")
+
+    lab.registry.stage("heavy", "heavy:Heavy")
+    own = Entry.load
+    monkeypatch.setattr(Entry, "load", lambda e: load(e) if e.name == "heavy" else own(e))
+    assert "stages that produce Mask: both, invert, threshold" in lab.faults(lab.chain("invert"))
+
+
+def test_an_output_that_nobody_takes_is_a_warning(lab: Lab):
+    class Count(Sink):
+        def consume(self, circles: Circles) -> None: ...
+
+    lab.registry.sink("count", Count)
+    text = lab.chain("threshold", "both").replace("collect", "count")
+    assert lab.compile(text).warnings == ("nobody takes what 'a' produces",)
+
+
+def test_a_sink_that_records_everything_takes_every_output(lab: Lab):
+    assert lab.compile(lab.chain("threshold", "both")).warnings == ()
+    assert Trace in {p.type for p in lab.compile(lab.chain("both")).sinks[0].ports.inputs}

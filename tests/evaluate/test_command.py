@@ -1,0 +1,324 @@
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import Result
+from typer.testing import CliRunner
+
+from mushpipe.cli import app
+from mushpipe.core.errors import EXIT_DAMAGED, EXIT_DIFFERS, InputError, UsageError
+from tests.evaluate.scenes import (
+    bed,
+    header,
+    locations_of,
+    picks_of,
+    rows_of,
+    write_recording,
+    write_results,
+)
+
+GRAPH = """
+mushpipe: 1
+source: {use: mcap, path: bed.mcap}
+stages:
+  segment: {use: otsu}
+  detect:  {use: hough, radius_px: [8, 45]}
+  locate:  {use: nearest-depth}
+  pick:    {use: picks}
+sinks:
+  log: {use: mcap, path: must-not-be-written.mcap}
+"""
+FAST = ["--resamples", "20"]
+
+
+def run(*arguments: Any) -> Result:
+    return CliRunner().invoke(app, ["eval", *FAST, *map(str, arguments)])
+
+
+def judged(*arguments: Any) -> dict[str, Any]:
+    result = run(*arguments, "--format", "json")
+    assert result.exception is None or result.exit_code == EXIT_DIFFERS, result.exception
+    content: dict[str, Any] = json.loads(result.stdout)
+    return content
+
+
+def metrics(content: dict[str, Any], number: int = 0) -> dict[str, float]:
+    overall = content["alternatives"][number]["overall"]["metrics"]
+    return {name: value["value"] for name, value in overall.items()}
+
+
+@pytest.fixture
+def truths() -> dict[int, Any]:
+    return {i: bed(i) for i in range(3)}
+
+
+@pytest.fixture
+def perfect(tmp_path: Path, truths: dict[int, Any]) -> Path:
+    answers = {i: picks_of(truth) for i, truth in truths.items()}
+    located = {i: locations_of(truth) for i, truth in truths.items()}
+    return write_results(tmp_path / "perfect.mcap", answers, truths, located, milliseconds=2.5)
+
+
+@pytest.fixture
+def graph(tmp_path: Path, truths: dict[int, Any]) -> Path:
+    write_recording(tmp_path / "bed.mcap", truths)
+    path = tmp_path / "graph.yaml"
+    path.write_text(GRAPH)
+    return path
+
+
+def test_truth_against_itself(perfect: Path) -> None:
+    content = judged(perfect)
+    values = metrics(content)
+    assert values["f"] == 1
+    assert values["surface_p95_mm"] == pytest.approx(0, abs=1e-6)
+    assert values["apex_p95_mm"] == pytest.approx(0, abs=1e-6)
+    assert values["calibration_tilt"] is None
+    (only,) = content["alternatives"]
+    assert only["overall"]["frames"] == 3
+    assert only["speed"]["pick"]["p95_ms"] == 2.5
+    assert content["exit_code"] == 0
+
+
+def test_text_says_the_same(perfect: Path) -> None:
+    result = run(perfect, "--threshold", "f>=0.99", "--threshold", "speed_total_p95_ms<3")
+    assert result.exit_code == 0
+    for word in ("recording", "perfect", "1.000", "apex", "Coverage", "kept", "2.50"):
+        assert word in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("threshold", "code"),
+    [
+        ("f>=0.99", 0),
+        ("|diameter_bias_mm|<0.1", 0),
+        ("upright_mean_deg<5", EXIT_DIFFERS),
+        ("calibration_tilt<2", EXIT_DIFFERS),
+        ("speed_pick_p50_ms<1", EXIT_DIFFERS),
+    ],
+)
+def test_thresholds_set_the_exit_code(perfect: Path, threshold: str, code: int) -> None:
+    assert run(perfect, "--threshold", threshold).exit_code == code
+
+
+@pytest.mark.parametrize("name", ["axis_mean", "speed_pik_p50_ms"])
+def test_a_misspelt_metric_is_found(perfect: Path, name: str) -> None:
+    result = run(perfect, "--threshold", f"{name}<1")
+    assert isinstance(result.exception, UsageError)
+    assert "did you mean" in str(result.exception)
+
+
+def test_truth_is_found_in_the_recording_the_results_name(
+    tmp_path: Path, truths: dict[int, Any]
+) -> None:
+    recording = write_recording(tmp_path / "bed.mcap", truths)
+    sha256 = hashlib.sha256(recording.read_bytes()).hexdigest()
+    manifest = {
+        "graph": {"source": {"use": "mcap", "path": "elsewhere/bed.mcap"}},
+        "recordings": [{"file": "bed.mcap", "sha256": sha256}],
+    }
+    answers = {i: picks_of(truth) for i, truth in truths.items()}
+    results = write_results(tmp_path / "r.mcap", answers, manifest=json.dumps(manifest))
+    assert metrics(judged(results))["f"] == 1
+    write_recording(recording, {0: bed(7)})  # no longer the one it was
+    result = run(results)
+    assert isinstance(result.exception, InputError)
+    assert "--truth" in str(result.exception)
+    assert metrics(judged(results, "--truth", write_recording(recording, truths)))["f"] == 1
+
+
+def test_labels_judge_the_frames_they_name(tmp_path: Path, truths: dict[int, Any]) -> None:
+    answers = {i: picks_of(truth) for i, truth in truths.items()}
+    results = write_results(tmp_path / "r.mcap", answers)
+    caps = [
+        {"u": u, "v": v, "radius_px": r}
+        for (u, v), r in zip(truths[1].center.tolist(), truths[1].radius.tolist(), strict=True)
+    ]
+    labels = tmp_path / "labels.json"
+    frames = [{"stamp_ns": header(1).stamp_ns, "caps": caps}]
+    labels.write_text(json.dumps({"mushpipe_labels": 1, "frames": frames}))
+    content = judged(results, "--truth", labels)
+    assert content["alternatives"][0]["overall"]["frames"] == 1
+    assert metrics(content)["f"] == 1
+    assert metrics(content)["apex_mean_mm"] is None
+    assert "2 frames have no truth" in content["alternatives"][0]["recordings"][0]["notes"][0]
+    labels.write_text(json.dumps({"mushpipe_labels": 1, "frames": [{"index": 99, "caps": []}]}))
+    assert isinstance(run(results, "--truth", labels).exception, InputError)
+
+
+def test_a_frame_without_an_answer_is_missed(tmp_path: Path, truths: dict[int, Any]) -> None:
+    answers = {i: picks_of(truths[i]) for i in (0, 1)}
+    results = write_results(tmp_path / "r.mcap", answers, truths)
+    content = judged(results)
+    assert metrics(content)["recall"] == pytest.approx(2 / 3)
+    assert content["alternatives"][0]["frames"][2]["answered"] is False
+    manifest = json.dumps({"graph": {"source": {"max_frames": 2}}})
+    partial = write_results(tmp_path / "p.mcap", answers, truths, manifest=manifest)
+    assert metrics(judged(partial))["recall"] == 1
+
+
+def test_several_results_are_judged_each_and_together(
+    tmp_path: Path, truths: dict[int, Any]
+) -> None:
+    files = []
+    for name, kept in (("a", 20), ("b", 10)):
+        answers = {i: picks_of(rows_of(t, slice(0, kept))) for i, t in truths.items()}
+        files.append(write_results(tmp_path / f"{name}.mcap", answers, truths))
+    (only,) = judged(*files)["alternatives"]
+    assert [r["metrics"]["recall"]["value"] for r in only["recordings"]] == [1, 0.5]
+    assert only["overall"]["metrics"]["recall"]["value"] == 0.75
+
+
+def test_damage_is_judged_as_far_as_it_goes(perfect: Path) -> None:
+    perfect.write_bytes(perfect.read_bytes()[:-200])
+    result = run(perfect)
+    assert result.exit_code == EXIT_DAMAGED
+    assert "note: perfect.mcap" in result.stdout
+
+
+def test_a_graph_is_run_and_judged(graph: Path, tmp_path: Path) -> None:
+    out = tmp_path / "kept"
+    content = judged(graph, "--recordings", tmp_path / "bed.mcap", "--out", out)
+    assert metrics(content)["f"] > 0.95
+    assert metrics(content)["coverage_position"] == 0
+    assert {"segment", "detect", "total"} <= content["alternatives"][0]["speed"].keys()
+    assert [path.name for path in out.iterdir()] == ["bed.mcap"]
+    assert not (tmp_path / "must-not-be-written.mcap").exists()
+
+
+def test_a_source_that_knows_the_truth_needs_no_recording(graph: Path, tmp_path: Path) -> None:
+    (tmp_path / "beds.py").write_text(
+        "from mushpipe import ReplaySource\n"
+        "from tests.evaluate.scenes import bed, frame\n"
+        "class Beds(ReplaySource):\n"
+        "    def frames(self):\n"
+        "        yield from (frame(i, bed(i)) for i in range(2))\n"
+    )
+    graph.write_text(GRAPH.replace("{use: mcap, path: bed.mcap}", "{use: './beds.py:Beds'}"))
+    content = judged(graph, "--report", tmp_path / "report")
+    assert content["alternatives"][0]["overall"]["frames"] == 2
+    assert metrics(content)["f"] > 0.95
+    assert (tmp_path / "report" / "index.html").read_text().count("data:image/jpeg") == 2
+
+
+def test_recordings_may_follow_the_graph_and_folders_are_opened(
+    graph: Path, tmp_path: Path, truths: dict[int, Any]
+) -> None:
+    folder = tmp_path / "set"
+    folder.mkdir()
+    write_recording(folder / "x.mcap", {0: truths[0]})
+    write_recording(folder / "y.mcap", {0: truths[1]})
+    write_recording(folder / "without.mcap", {})
+    content = judged(graph, "--recordings", tmp_path / "bed.mcap", folder, "--frames", 1)
+    (only,) = content["alternatives"]
+    assert [r["name"] for r in only["recordings"]] == ["bed", "x", "y"]
+    assert only["overall"]["frames"] == 3
+
+
+def test_matrix_compares_on_the_same_frames(graph: Path, tmp_path: Path) -> None:
+    arguments = (graph, "--recordings", tmp_path / "bed.mcap", "--matrix")
+    content = judged(*arguments, "detect.radius_px=[8,45],[8,20]", "--threshold", "f>=0.95")
+    first, second = (metrics(content, i) for i in (0, 1))
+    (difference,) = content["differences"]
+    assert difference["label"] == "detect.radius_px=[8,20]"
+    assert difference["metrics"]["recall"]["value"] == pytest.approx(
+        second["recall"] - first["recall"]
+    )
+    assert difference["metrics"]["recall"]["high"] < 0
+    assert [t["kept"] for t in content["thresholds"]] == [True, False]
+    assert content["exit_code"] == EXIT_DIFFERS
+    assert "did you mean 'otsu'" in str(run(*arguments, "segment.use=otsu,otsuu").exception)
+    shown = run(*arguments, "detect.radius_px=[8,45],[8,44]").stdout
+    assert "minus detect.radius_px=[8,45], on the same 3 frames" in shown
+
+
+def test_options_that_need_a_graph_say_so(perfect: Path) -> None:
+    result = run(perfect, "--matrix", "a.b=1,2")
+    assert isinstance(result.exception, UsageError)
+    assert isinstance(run(perfect, "--gravity", "0,0,0").exception, UsageError)
+    assert isinstance(run(perfect, "--topic", "/mushpipe/pik").exception, UsageError)
+
+
+def test_a_recording_is_not_a_result(tmp_path: Path, truths: dict[int, Any]) -> None:
+    result = run(write_recording(tmp_path / "bed.mcap", truths))
+    assert isinstance(result.exception, InputError)
+    assert "no picks or circles" in str(result.exception)
+
+
+def test_gravity_changes_what_upright_means(perfect: Path) -> None:
+    plain = metrics(judged(perfect))["upright_mean_deg"]
+    assert metrics(judged(perfect, "--gravity", "0,1,1"))["upright_mean_deg"] > plain + 10
+
+
+class Page(HTMLParser):
+    """Collects what a page refers to, and whether its tags close."""
+
+    VOID = ("meta", "image", "circle", "line", "path", "use", "rect", "br")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.references: list[str] = []
+        self.tags: list[str] = []
+        self.seen: list[str] = []
+        self.ids: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.seen.append(tag)
+        for name, value in attrs:
+            if name in ("src", "href", "xlink:href", "srcset", "data", "action"):
+                self.references.append(value or "")
+            if name == "id":
+                self.ids.append(value or "")
+        if tag != "meta":
+            self.tags.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.handle_starttag(tag, attrs)
+        self.handle_endtag(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.tags.pop() == tag
+
+
+def test_report_is_one_page_of_its_own(graph: Path, tmp_path: Path) -> None:
+    report = tmp_path / "report"
+    matrix = "detect.radius_px=[8,45],[8,20]"
+    arguments = (graph, "--recordings", tmp_path / "bed.mcap", "--matrix", matrix)
+    result = run(*arguments, "--report", report)
+    assert result.exit_code == 0
+    assert [path.name for path in report.iterdir()] == ["index.html"]
+    text = (report / "index.html").read_text()
+    page = Page()
+    page.feed(text)
+    assert not page.tags
+    assert page.references
+    assert all(ref.startswith(("data:image/", "#")) for ref in page.references)
+    assert not {"script", "link", "iframe", "object"} & set(page.seen)
+    assert not re.search(r"@import|url\((?!#)", text)
+    assert len(set(page.ids)) == len(page.ids)
+    targets = {ref[1:] for ref in page.references if ref.startswith("#")}
+    assert targets <= set(page.ids)
+    assert "prefers-color-scheme: dark" in text
+    assert str(tmp_path) not in text
+
+
+def test_report_of_nothing_found(tmp_path: Path, truths: dict[int, Any]) -> None:
+    nothing = {i: picks_of(rows_of(truth, slice(0, 0))) for i, truth in truths.items()}
+    results = write_results(tmp_path / "r.mcap", nothing, truths)
+    assert run(results, "--report", tmp_path / "report").exit_code == 0
+    text = (tmp_path / "report" / "index.html").read_text()
+    assert text.count("20 missed, 0 false") == 3
+
+
+def test_report_of_a_frame_with_nothing_in_it(tmp_path: Path) -> None:
+    empty = rows_of(bed(0), slice(0, 0))
+    results = write_results(tmp_path / "r.mcap", {0: picks_of(empty)}, {0: empty})
+    assert run(results, "--report", tmp_path / "report").exit_code == 0
+    assert np.isnan(float(metrics(judged(results))["f"] or "nan"))

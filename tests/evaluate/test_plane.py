@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from mushpipe import RgbdFrame
+from mushpipe.cli import app
+from mushpipe.core.errors import InputError, UsageError
+from mushpipe.core.recording import RecordingWriter
+from mushpipe.evaluate.plane import judge_planes, measure_plane, plane_values, window_of
+from tests.evaluate.scenes import frame
+
+
+def plane(folder: Path, distance: float, offset: float, sigma: float, seed: int = 0) -> Path:
+    """A recording of three frames of a plane in units of 1/8 mm."""
+    path = folder / f"plane-{distance}.mcap"
+    writer = RecordingWriter(path, {})
+    rng = np.random.default_rng(seed)
+    for i in range(3):
+        depth = distance + offset + rng.normal(0, sigma, (480, 640))
+        frame_ = frame(i, depth=np.rint(depth / 0.000125).astype(np.uint16))
+        writer.frame(RgbdFrame(**{**vars(frame_), "color": frame_.color}))
+    writer.close()
+    return path
+
+
+def test_values_by_hand() -> None:
+    window = np.full((31, 31), 500.0)
+    window[0, :] = np.nan
+    window[1, 0] = 503.0
+    window[1, 1] = 497.0
+    values = plane_values(window, 0.498)
+    assert values["mean_mm"] == pytest.approx(500)
+    assert values["offset_mm"] == pytest.approx(2)
+    assert values["range_mm"] == pytest.approx(6)
+    assert values["std_mm"] == pytest.approx(np.sqrt(18 / 930))
+    assert values["valid"] == pytest.approx(30 / 31)
+
+
+def test_a_slanted_plane_is_flat_about_itself() -> None:
+    v, u = np.mgrid[:31, :31]
+    values = plane_values(500 + 0.1 * u - 0.2 * v, 0.5)
+    assert values["std_mm"] > 1
+    assert values["flat_std_mm"] == pytest.approx(0, abs=1e-9)
+
+
+def test_without_depth_nothing_is_known() -> None:
+    values = plane_values(np.full((31, 31), np.nan), 0.5)
+    assert values.pop("valid") == 0
+    assert all(map(np.isnan, values.values()))
+
+
+def test_the_window_is_central() -> None:
+    depth = np.zeros((41, 61), np.float32)
+    depth[20, 30] = 1
+    window = window_of(depth)
+    assert window.shape == (31, 31)
+    assert window[15, 15] == 1000
+    with pytest.raises(InputError, match="smaller"):
+        window_of(np.zeros((30, 40), np.float32))
+
+
+def test_a_recording_gives_what_was_put_in(tmp_path: Path) -> None:
+    row = measure_plane(plane(tmp_path, 0.51, 0.0028, 0.0011), 0.51)
+    assert row.frames == 3
+    assert row.values["offset_mm"].value == pytest.approx(2.8, abs=0.1)
+    assert row.values["std_mm"].value == pytest.approx(1.1, abs=0.1)
+    offset = row.values["offset_mm"]
+    assert offset.low <= offset.value <= offset.high
+
+
+def test_one_distance_for_all_or_one_each(tmp_path: Path) -> None:
+    files = [plane(tmp_path, 0.51, 0.003, 0.001), plane(tmp_path, 0.79, 0.003, 0.001)]
+    rows, outcomes, code = judge_planes(files, "0.51,0.79", ["offset_mm<=5"], 50, 0)
+    assert [round(row.values["offset_mm"].value) for row in rows] == [3, 3]
+    assert (len(outcomes), code) == (2, 0)
+    _, outcomes, code = judge_planes(files, "0.51", ["offset_mm<=5"], 50, 0)
+    assert ([o.kept for o in outcomes], code) == ([True, False], 3)
+    with pytest.raises(UsageError, match="one distance"):
+        judge_planes(files, "0.51,0.6,0.7", [], 0, 0)
+    with pytest.raises(UsageError, match="expected metres"):
+        judge_planes(files, "51cm", [], 0, 0)
+    with pytest.raises(UsageError, match="did you mean 'offset_mm'"):
+        judge_planes(files, "0.51", ["offset<1"], 0, 0)
+
+
+def test_a_recording_without_depth_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "flat.mcap"
+    writer = RecordingWriter(path, {})
+    writer.frame(frame(0))
+    writer.close()
+    with pytest.raises(InputError, match="no depth"):
+        measure_plane(path, 0.5)
+
+
+def test_command(tmp_path: Path) -> None:
+    path = plane(tmp_path, 0.51, 0.0028, 0.001)
+    result = CliRunner().invoke(app, ["eval", "--plane", "0.51", str(path)])
+    assert result.exit_code == 0
+    assert "offset mm" in result.stdout
+    assert "2.8" in result.stdout

@@ -1,0 +1,197 @@
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mushpipe import Header
+from mushpipe.core.errors import InputError
+from mushpipe.core.truth import Ignore
+from mushpipe.evaluate.labels import convert
+from mushpipe.evaluate.truth import has_truth, read_truth
+from tests.evaluate.scenes import FRAME, bed, header, write_recording, write_results
+
+FULL = {
+    "mushpipe_labels": 1,
+    "note": "by hand",
+    "frame_id": "camera",
+    "frames": [
+        {
+            "stamp_ns": 17,
+            "caps": [
+                {
+                    "u": 10.5, "v": 20, "radius_px": 5, "id": 7, "visible": 0.5,
+                    "surface_m": [0, 0, 0.5], "apex_m": [0.01, 0, 0.49], "axis": [0, 0, -2],
+                    "diameter_m": 0.04, "diameter_max_m": 0.042,
+                },
+                {"u": 1, "v": 2, "radius_px": 3, "ignore": "cut-stump", "id": 8},
+            ],
+            "may_find": [{"u": 5, "v": 6, "radius_px": 7}],
+        },
+        {"index": 3, "caps": []},
+    ],
+}  # fmt: skip
+
+
+def written(folder: Path, document: Any) -> Path:
+    path = folder / "labels.json"
+    path.write_text(json.dumps(document))
+    return path
+
+
+def test_own_format_is_read_in_full(tmp_path: Path) -> None:
+    truth = read_truth(written(tmp_path, FULL))
+    first = truth.frames["stamp_ns", 17]
+    assert first.frame_id == "camera"
+    assert first.caps.id.tolist() == [7, 8]
+    assert first.caps.center.tolist() == [[10.5, 20], [1, 2]]
+    assert first.caps.axis[0].tolist() == [0, 0, -1]
+    assert np.isnan(first.caps.axis[1]).all()
+    assert math.isnan(first.caps.diameter[1])
+    assert first.caps.ignore.tolist() == [Ignore.COUNTS, Ignore.CUT_STUMP]
+    assert first.may_find.tolist() == [[5, 6, 7]]
+    assert truth.place(Header(17, 0, "")) == ("stamp_ns", 17)
+    assert truth.place(Header(99, 3, "")) == ("index", 3)
+    assert truth.place(Header(99, 4, "")) is None
+
+
+def test_ellipses_with_may_find_circles(tmp_path: Path) -> None:
+    document = {
+        "rule": "recall over must_find",
+        "must_find": [
+            {"cx": 50, "cy": 60, "ellipse_px": [40, 90, 30.0], "diam_silhouette": 36.0},
+            {"cx": 150, "cy": 60, "ellipse_px": [20, 20, 0]},
+        ],
+        "may_find": [{"cx": 1, "cy": 2, "r": 3}],
+    }
+    frame = read_truth(written(tmp_path, document)).frames["index", 0]
+    assert frame.caps.radius.tolist() == pytest.approx([30, 10])
+    assert frame.caps.diameter[0] == pytest.approx(0.036)
+    assert math.isnan(frame.caps.diameter[1])
+    assert frame.may_find.tolist() == [[1, 2, 3]]
+
+
+def test_circles_with_ignore(tmp_path: Path) -> None:
+    caps = [
+        {"u": 1, "v": 2, "radius_px": 3, "ignore": False},
+        {"u": 4, "v": 5, "radius_px": 6, "ignore": True},
+    ]
+    frame = read_truth(written(tmp_path, {"stamp_ns": 5, "caps": caps})).frames["stamp_ns", 5]
+    assert frame.caps.ignore.tolist() == [Ignore.COUNTS, Ignore.AMBIGUOUS]
+
+
+def test_boxes(tmp_path: Path) -> None:
+    caps = [{"bbox": [100, 200, 41, 41]}, {"bbox": [0, 0, 90, 40], "near_border": True}]
+    frames = [{"stamp_ns": 1, "caps": []}, {"stamp_ns": 2, "caps": caps}]
+    truth = read_truth(written(tmp_path, {"frames": frames}))
+    assert len(truth.frames["stamp_ns", 1].caps) == 0
+    found = truth.frames["stamp_ns", 2].caps
+    assert found.center[0].tolist() == [120, 220]
+    assert found.radius.tolist() == pytest.approx([20.5, 30])
+    assert found.ignore.tolist() == [Ignore.COUNTS, Ignore.AT_BORDER]
+
+
+def test_conversion_leaves_the_own_format_alone() -> None:
+    assert convert(FULL) is FULL
+    assert convert(convert({"caps": [], "stamp_ns": 1}))["mushpipe_labels"] == 1
+
+
+@pytest.mark.parametrize(
+    ("document", "message"),
+    [
+        ([], "expected a JSON object"),
+        ({"boxes": []}, "none of mushpipe_labels"),
+        ({"must_find": [{"cx": 1}]}, "must_find"),
+        ({"frames": [{"caps": []}]}, "stamp_ns"),
+        ({"mushpipe_labels": 1, "frames": [{"index": 0, "caps": [{"u": 1}]}]}, "frames.0.caps.0.v"),
+        ({"mushpipe_labels": 1, "frames": [{"caps": []}]}, "either stamp_ns or index"),
+        ({"mushpipe_labels": 2, "frames": []}, "mushpipe_labels"),
+        (
+            {"mushpipe_labels": 1, "frames": [{"index": 0, "caps": []}, {"index": 0, "caps": []}]},
+            "labelled twice",
+        ),
+        (
+            {
+                "mushpipe_labels": 1,
+                "frames": [{"index": 0, "caps": [{"u": 1, "v": 1, "radius_px": -1}]}],
+            },
+            "radius_px",
+        ),
+        (
+            {
+                "mushpipe_labels": 1,
+                "frames": [
+                    {"index": 0, "caps": [{"u": 1, "v": 1, "radius_px": 1, "axis": [0, 0, 0]}]}
+                ],
+            },
+            "an axis needs a length",
+        ),
+        ({"stamp_ns": 1, "caps": [5]}, "labels with 'caps'"),
+        (
+            {
+                "mushpipe_labels": 1,
+                "frames": [{"index": 4, "caps": [{"u": 1, "v": 1, "radius_px": 1, "id": 3}] * 2}],
+            },
+            "index=4: Truth: ids must be unique",
+        ),
+    ],
+)
+def test_wrong_labels_are_refused_with_their_place(
+    tmp_path: Path, document: Any, message: str
+) -> None:
+    with pytest.raises(InputError, match=message) as error:
+        read_truth(written(tmp_path, document))
+    assert "labels.json" in str(error.value)
+
+
+def test_files_that_are_not_there_or_no_json(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such"):
+        read_truth(tmp_path / "none.json")
+    (tmp_path / "bad.json").write_text("{")
+    with pytest.raises(InputError, match="no labels"):
+        read_truth(tmp_path / "bad.json")
+
+
+def test_truth_of_a_recording(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "bed.mcap", {0: bed(0), 1: bed(1)})
+    assert has_truth(path)
+    truth = read_truth(path)
+    assert len(truth.frames) == 2
+    frame = truth.frames["stamp_ns", header(1).stamp_ns]
+    assert frame.frame_id == FRAME
+    assert (frame.caps.apex == bed(1).apex).all()
+
+
+def test_a_recording_without_truth_says_so(tmp_path: Path) -> None:
+    path = write_results(tmp_path / "none.mcap", {})
+    assert not has_truth(path)
+    with pytest.raises(InputError, match="carries no truth"):
+        read_truth(path)
+
+
+FIELD = os.environ.get("MUSHPIPE_FIELD_DATA")
+real = pytest.mark.skipif(not FIELD, reason="MUSHPIPE_FIELD_DATA names no folder of field data")
+
+
+@real
+@pytest.mark.parametrize(
+    ("name", "frames", "caps", "ignored", "may_find"),
+    [
+        ("white-bed-0", 1, 13, 0, 24),
+        ("beds-colour-only", 1, 207, 44, 0),
+        ("desk-june", 2, 1, 0, 0),
+        ("desk-july", 1, 5, 3, 0),
+    ],
+)
+def test_real_labels(name: str, frames: int, caps: int, ignored: int, may_find: int) -> None:
+    truth = read_truth(Path(FIELD or "") / f"{name}.labels.json")
+    assert len(truth.frames) == frames
+    parts = list(truth.frames.values())
+    assert sum(len(part.caps) for part in parts) == caps
+    assert sum(int((part.caps.ignore != 0).sum()) for part in parts) == ignored
+    assert sum(len(part.may_find) for part in parts) == may_find

@@ -1,0 +1,171 @@
+"""Calibration of a recording: once, per frame, late, absent, wrong; and frames of other sizes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mushpipe.core.errors import InputError
+from mushpipe.core.geometry import Camera
+from mushpipe.sources.mcap import McapSource
+from tests.io.bags import (
+    COLOR,
+    COLOR_INFO,
+    CX,
+    CY,
+    FX,
+    FY,
+    HEIGHT,
+    PERIOD,
+    T0,
+    WIDTH,
+    Entry,
+    camera_info,
+    color_at,
+    color_pixels,
+    drain,
+    play,
+    raw_image,
+    write_bag,
+    write_foxglove,
+)
+
+CALIBRATED = Camera(WIDTH, HEIGHT, FX, FY, CX, CY)
+COLORS = [color_at(i) for i in range(3)]
+SMALL = (4, 3)
+
+
+def info_at(i: int, **fields: Any) -> Entry:
+    at = T0 + i * PERIOD
+    return COLOR_INFO, at, camera_info(at, **fields)
+
+
+def cameras(tmp_path: Path, entries: list[Entry], **settings: Any) -> list[Camera | None]:
+    return [frame.camera for frame in play(write_bag(tmp_path, entries), **settings)]
+
+
+@pytest.mark.parametrize(
+    "entries",
+    [
+        [info_at(0), *COLORS],
+        [e for i in range(3) for e in (info_at(i), color_at(i))],
+        [*COLORS, info_at(3)],
+    ],
+    ids=["once", "per frame", "late"],
+)
+def test_every_frame_gets_the_calibration(entries: list[Entry], tmp_path: Path) -> None:
+    assert cameras(tmp_path, entries) == [CALIBRATED] * 3
+
+
+@pytest.mark.parametrize(
+    "entries",
+    [COLORS, [info_at(0, k=(0,) * 9), *COLORS]],
+    ids=["absent", "all zero, which means uncalibrated"],
+)
+def test_without_calibration_frames_are_played_and_it_is_said(
+    entries: list[Entry], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert cameras(tmp_path, entries) == [None] * 3
+    text = "bag.mcap has no calibration: nothing can be measured in metres"
+    assert caplog.messages.count(text) == 1
+
+
+def test_intrinsics_may_be_given(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    given = {"fx": 600.0, "fy": 601.0, "cx": 4.0, "cy": 3.0}
+    expected = Camera(WIDTH, HEIGHT, 600.0, 601.0, 4.0, 3.0)
+    assert cameras(tmp_path / "a", COLORS, camera=given) == [expected] * 3
+    assert cameras(tmp_path / "b", [info_at(0), *COLORS], camera=given) == [expected] * 3
+    assert not any("no calibration" in text for text in caplog.messages)
+
+
+def test_distortion_is_kept(tmp_path: Path) -> None:
+    d = (0.1, -0.2, 0.001, 0.002, 0.05)
+    expected = Camera(WIDTH, HEIGHT, FX, FY, CX, CY, "brown_conrady", d)
+    assert cameras(tmp_path, [info_at(0, d=d), *COLORS]) == [expected] * 3
+
+
+@pytest.mark.parametrize("model", ["plumb_bob", "equidistant", ""])
+def test_distortion_of_zeros_is_none(model: str, tmp_path: Path) -> None:
+    assert cameras(tmp_path, [info_at(0, model=model), *COLORS]) == [CALIBRATED] * 3
+
+
+@pytest.mark.parametrize(
+    ("model", "d"), [("equidistant", (0.1, 0.2, 0.3, 0.4)), ("rational_polynomial", (0.1,) * 8)]
+)
+def test_an_unsupported_lens_model_is_reported_after_the_frames(
+    model: str, d: tuple[float, ...], tmp_path: Path
+) -> None:
+    source = McapSource(path=write_bag(tmp_path, [info_at(0, d=d, model=model), *COLORS]))
+    frames, error = drain(source)
+    assert [frame.camera for frame in frames] == [None] * 3
+    assert f"distortion model '{model}' with {len(d)} coefficients is not supported" in str(error)
+    assert error is not None
+    assert error.exit_code == 4
+    assert source.counts() == {"calibrations that could not be decoded": 1}
+
+
+def test_a_calibration_that_changes_is_followed(tmp_path: Path) -> None:
+    entries = [info_at(0), color_at(0), info_at(1, k=(99, 0, 1, 0, 99, 1, 0, 0, 1)), color_at(1)]
+    found = cameras(tmp_path, entries)
+    assert [camera.fx for camera in found if camera] == [FX, 99]
+
+
+@pytest.mark.parametrize("start", [1.5 * PERIOD, 2 * PERIOD])
+def test_a_start_after_the_change_uses_the_later_calibration(start: float, tmp_path: Path) -> None:
+    changed = info_at(1, k=(99, 0, 1, 0, 99, 1, 0, 0, 1))
+    entries = [info_at(0), color_at(0), changed, color_at(1), color_at(2)]
+    found = cameras(tmp_path, entries, start=start / 1e9)
+    assert [camera.fx for camera in found if camera] == [99]
+
+
+def test_every_turn_of_a_loop_begins_with_the_calibration_of_the_first(tmp_path: Path) -> None:
+    changed = info_at(1, k=(99, 0, 1, 0, 99, 1, 0, 0, 1))
+    # The calibration stands after the first image, as late ones do.
+    entries = [color_at(0), (COLOR_INFO, T0 + 1, camera_info()), changed, color_at(1)]
+    found = cameras(tmp_path, entries, loop=2)
+    assert [camera.fx for camera in found if camera] == [FX, 99, FX, 99]
+
+
+def test_calibration_of_another_size_is_refused(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, [info_at(0, size=(640, 480)), *COLORS])
+    with pytest.raises(InputError) as error:
+        play(path)
+    assert str(error.value) == (
+        f"{path}, frame 0: the image is 8x6, its calibration is for 640x480"
+    )
+    assert error.value.exit_code == 4
+
+
+def shrinking() -> list[Entry]:
+    small = raw_image(color_pixels(1, SMALL), "rgb8", T0 + PERIOD)
+    return [color_at(0), (COLOR, T0 + PERIOD, small)]
+
+
+def test_a_change_of_size_without_calibration_is_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    frames = play(write_bag(tmp_path, shrinking()))
+    assert [frame.color.shape[:2] for frame in frames] == [(6, 8), (3, 4)]
+    assert "the frame size changes from 8x6 to 4x3 at frame 1" in caplog.messages
+
+
+def test_a_change_of_size_that_the_calibration_does_not_follow_ends_the_playback(
+    tmp_path: Path,
+) -> None:
+    source = McapSource(path=write_bag(tmp_path, [info_at(0), *shrinking()]))
+    frames, error = drain(source)
+    assert len(frames) == 1
+    assert "frame 1: the image is 4x3, its calibration is for 8x6" in str(error)
+
+
+def test_a_change_of_size_that_the_calibration_follows_is_played(tmp_path: Path) -> None:
+    first, second = shrinking()
+    frames = play(write_bag(tmp_path, [info_at(0), first, info_at(1, size=SMALL), second]))
+    assert [frame.color.shape[:2] for frame in frames] == [(6, 8), (3, 4)]
+
+
+def test_foxglove_calibration(tmp_path: Path) -> None:
+    frames = play(write_foxglove(tmp_path / "f.mcap", 2))
+    assert [frame.camera for frame in frames] == [CALIBRATED] * 2

@@ -1,0 +1,185 @@
+"""Colour and depth that belong together; leftovers are counted, no colour image is ever lost."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mushpipe.core.types import RgbdFrame
+from mushpipe.sources.mcap import McapSource
+from mushpipe.sources.pairing import Pairing
+from tests.io.bags import (
+    PERIOD,
+    T0,
+    Entry,
+    color_at,
+    color_pixels,
+    depth_at,
+    depth_pixels,
+    rgbd,
+    write_bag,
+)
+
+MS = 1_000_000
+ALONE = "colour images without depth"
+LEFT = "depth images without colour"
+
+
+def run(
+    tmp_path: Path, entries: list[Entry], **settings: float
+) -> tuple[list[RgbdFrame], dict[str, int]]:
+    source = McapSource(path=write_bag(tmp_path, entries), **settings)
+    return list(source.frames()), source.counts()
+
+
+def partners(frames: list[RgbdFrame]) -> list[tuple[int, int | None]]:
+    """Return which colour was paired with which depth, told by their pixels."""
+    found = []
+    for frame in frames:
+        color = next(i for i in range(50) if np.array_equal(frame.color, color_pixels(i)))
+        depths = (i for i in range(50) if np.array_equal(frame.depth, depth_pixels(i)))
+        found.append((color, None if frame.depth is None else next(depths)))
+    return found
+
+
+@pytest.mark.parametrize("delay_ms", [-14, -1, 0, 1, 14])
+def test_stamps_may_differ_a_little(delay_ms: int, tmp_path: Path) -> None:
+    entries: list[Entry] = []
+    for i in range(5):
+        entries += [color_at(i), depth_at(i, T0 + i * PERIOD + delay_ms * MS)]
+    frames, counts = run(tmp_path, entries)
+    assert partners(frames) == [(i, i) for i in range(5)]
+    assert counts == {}
+    assert [f.header.stamp_ns for f in frames] == [T0 + i * PERIOD for i in range(5)]
+
+
+def test_stamps_that_differ_too_much_are_not_paired_but_counted(tmp_path: Path) -> None:
+    entries: list[Entry] = []
+    for i in range(3):
+        entries += [color_at(i), depth_at(i, T0 + i * PERIOD + 16 * MS)]
+    frames, counts = run(tmp_path, entries, pair_tolerance_ms=15)
+    assert partners(frames) == [(0, None), (1, None), (2, None)]
+    assert counts == {ALONE: 3, LEFT: 3}
+
+
+def test_the_tolerance_is_a_setting(tmp_path: Path) -> None:
+    entries = [color_at(0), depth_at(0, T0 + 1)]
+    assert run(tmp_path / "a", entries, pair_tolerance_ms=0)[1] == {ALONE: 1, LEFT: 1}
+    assert run(tmp_path / "b", entries, pair_tolerance_ms=0.001)[1] == {}
+
+
+@pytest.mark.parametrize(
+    ("depths", "expected", "counts"),
+    [
+        ([0, 1, 3, 4], [0, 1, None, 3, 4], {ALONE: 1}),
+        ([0, 1], [0, 1, None, None, None], {ALONE: 3}),
+        ([3, 4], [None, None, None, 3, 4], {ALONE: 3}),
+        ([0, 1, 2, 3, 4, 5, 6], [0, 1, 2, 3, 4], {LEFT: 2}),
+        ([], [None] * 5, {}),
+    ],
+)
+def test_missing_depth_never_costs_a_colour_image(
+    depths: list[int], expected: list[int | None], counts: dict[str, int], tmp_path: Path
+) -> None:
+    entries = sorted([*map(color_at, range(5)), *map(depth_at, depths)], key=lambda e: e[1])
+    frames, counted = run(tmp_path, entries)
+    assert partners(frames) == list(enumerate(expected))
+    assert counted == counts
+
+
+def test_depth_that_ends_early_does_not_pile_up_colour(tmp_path: Path) -> None:
+    source = McapSource(path=write_bag(tmp_path, [*rgbd([0]), *map(color_at, range(1, 45))]))
+    frames = source.frames()
+    assert partners([next(frames) for _ in range(45)])[-1] == (44, None)
+    assert list(frames) == []
+    assert source.counts() == {ALONE: 44}
+
+
+def test_depth_may_be_recorded_before_its_colour(tmp_path: Path) -> None:
+    entries = [e for i in range(4) for e in (depth_at(i), color_at(i))]
+    frames, counts = run(tmp_path, entries)
+    assert partners(frames) == [(i, i) for i in range(4)]
+    assert counts == {}
+
+
+def test_the_nearest_depth_is_taken(tmp_path: Path) -> None:
+    entries = [
+        depth_at(7, T0 - 9 * MS),
+        depth_at(0, T0 - 2 * MS),
+        color_at(0),
+        depth_at(8, T0 + 5 * MS),
+        color_at(1),
+        depth_at(1),
+    ]
+    frames, counts = run(tmp_path, entries)
+    assert partners(frames) == [(0, 0), (1, 1)]
+    assert counts == {LEFT: 2}
+
+
+def test_at_90_frames_per_second_a_lost_depth_does_not_shift_the_others(tmp_path: Path) -> None:
+    # The period is shorter than the tolerance, so a neighbour's depth would do.
+    period = 11 * MS
+    entries: list[Entry] = []
+    for i in range(6):
+        entries.append(color_at(i, T0 + i * period))
+        if i != 2:
+            entries.append(depth_at(i, T0 + i * period))
+    frames, counts = run(tmp_path, entries)
+    assert partners(frames) == [(0, 0), (1, 1), (2, None), (3, 3), (4, 4), (5, 5)]
+    assert counts == {ALONE: 1}
+
+
+def test_a_clock_that_was_set_back_costs_nothing(tmp_path: Path) -> None:
+    entries: list[Entry] = []
+    for i in range(6):
+        stamp = T0 + (i % 3) * PERIOD
+        entries += [color_at(i, stamp), depth_at(i, stamp)]
+    frames, counts = run(tmp_path, entries)
+    assert partners(frames) == [(i, i) for i in range(6)]
+    assert counts == {}
+
+
+def test_depth_without_colour_for_long_is_not_kept() -> None:
+    pairing: Pairing[str, int] = Pairing(0)
+    for stamp in range(1000):
+        assert list(pairing.add_depth(stamp, stamp)) == []
+    assert pairing.depth_alone == 1000 - Pairing.PATIENCE
+    assert list(pairing.add_color(999, "last")) == [("last", 999)]
+    assert list(pairing.finish()) == []
+    assert pairing.depth_alone == 999
+
+
+def brute_force(colors: list[int], depths: list[int], tolerance: int) -> set[int]:
+    """Return the colours that have any depth within the tolerance."""
+    return {c for c in colors if any(abs(c - d) <= tolerance for d in depths)}
+
+
+stamps = st.sets(st.integers(0, 300), max_size=25).map(sorted)
+
+
+@given(colors=stamps, depths=stamps, tolerance=st.integers(0, 20))
+def test_every_colour_comes_out_once_in_order_and_every_depth_is_accounted_for(
+    colors: list[int], depths: list[int], tolerance: int
+) -> None:
+    pairing: Pairing[int, int] = Pairing(tolerance)
+    arriving = sorted([(s, "color") for s in colors] + [(s, "depth") for s in depths])
+    out: list[tuple[int, int | None]] = []
+    for stamp, kind in arriving:
+        out += (pairing.add_color if kind == "color" else pairing.add_depth)(stamp, stamp)
+    out += pairing.finish()
+    assert [color for color, _ in out] == colors
+    paired = [(color, depth) for color, depth in out if depth is not None]
+    assert all(abs(color - depth) <= tolerance for color, depth in paired)
+    assert [depth for _, depth in paired] == sorted({depth for _, depth in paired})
+    assert pairing.color_alone == len(colors) - len(paired)
+    assert pairing.depth_alone == len(depths) - len(paired)
+    assert {color for color, _ in paired} <= brute_force(colors, depths, tolerance)
+    assert {color for color, depth in paired if color == depth} == {*colors} & {*depths}
+    if all(b - a > 2 * tolerance for a, b in pairwise(colors)):
+        # No two colours compete for a depth, so each that can have one gets one.
+        assert {color for color, _ in paired} == brute_force(colors, depths, tolerance)

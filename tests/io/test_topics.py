@@ -1,0 +1,199 @@
+"""Which topics are colour, depth and calibration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mushpipe.core.errors import InputError
+from mushpipe.core.types import RgbdFrame
+from tests.io.bags import (
+    ALIGNED,
+    CAMERA,
+    COLOR,
+    COLOR_INFO,
+    RECT,
+    T0,
+    Entry,
+    camera_info,
+    color_at,
+    color_pixels,
+    compressed,
+    depth_at,
+    depth_pixels,
+    depth_png,
+    encoded,
+    play,
+    raw_image,
+    rgbd,
+    write_bag,
+)
+
+OTHER_INFO = camera_info(k=(99, 0, 1, 0, 99, 1, 0, 0, 1))
+LEFT = "/left/color/image_raw"
+RIGHT = "/right/color/image_raw"
+LEFT_DEPTH = "/left/aligned_depth_to_color/image_raw"
+RIGHT_DEPTH = "/right/aligned_depth_to_color/image_raw"
+
+
+def first(tmp_path: Path, entries: list[Entry], **settings: object) -> RgbdFrame:
+    return play(write_bag(tmp_path, entries), **settings)[0]
+
+
+def refusal(tmp_path: Path, entries: list[Entry], **settings: object) -> str:
+    """Return what is said about a recording, without the path that it begins with."""
+    path = write_bag(tmp_path, entries)
+    with pytest.raises(InputError) as error:
+        play(path, **settings)
+    assert error.value.exit_code == 4
+    return str(error.value).removeprefix(f"{path}: ")
+
+
+@pytest.mark.parametrize("namespace", ["/camera/camera", "/camera", "", "/robot1/D405"])
+def test_names_of_old_and_new_nodes_are_known(namespace: str, tmp_path: Path) -> None:
+    entries = [(t.replace("/camera/camera", namespace), at, m) for t, at, m in rgbd([0])]
+    frame = first(tmp_path, entries)
+    np.testing.assert_array_equal(frame.color, color_pixels(0))
+    np.testing.assert_array_equal(frame.depth, depth_pixels(0))
+    assert frame.camera is not None
+
+
+def test_infrared_and_unaligned_depth_beside_the_right_topics_do_no_harm(tmp_path: Path) -> None:
+    infra = raw_image(color_pixels(5)[..., :1], "mono8")
+    rect = raw_image(depth_pixels(5), "16UC1", frame_id="camera_depth_optical_frame")
+    entries = [
+        *rgbd([0]),
+        (CAMERA + "infra1/image_rect_raw", T0, infra),
+        (CAMERA + "infra1/camera_info", T0, OTHER_INFO),
+        (RECT, T0, rect),
+        (CAMERA + "depth/camera_info", T0, OTHER_INFO),
+        (CAMERA + "aligned_depth_to_color/camera_info", T0, OTHER_INFO),
+    ]
+    frame = first(tmp_path, entries)
+    np.testing.assert_array_equal(frame.color, color_pixels(0))
+    np.testing.assert_array_equal(frame.depth, depth_pixels(0))
+    assert frame.camera is not None
+    assert frame.camera.fx == 617.5
+
+
+def test_of_a_raw_topic_and_its_compressed_twin_the_raw_one_is_played(tmp_path: Path) -> None:
+    jpeg = encoded(color_pixels(9), ".jpg")
+    entries = [
+        *rgbd([0]),
+        (COLOR + "/compressed", T0, compressed(jpeg, "rgb8; jpeg compressed bgr8")),
+        (
+            ALIGNED + "/compressedDepth",
+            T0,
+            compressed(depth_png(depth_pixels(9)), "16UC1; compressedDepth png"),
+        ),
+    ]
+    frame = first(tmp_path, entries)
+    np.testing.assert_array_equal(frame.color, color_pixels(0))
+    np.testing.assert_array_equal(frame.depth, depth_pixels(0))
+
+
+def test_compressed_topics_find_the_calibration_beside_them(tmp_path: Path) -> None:
+    png = compressed(encoded(color_pixels(0)[..., ::-1], ".png"), "rgb8; png compressed bgr8")
+    entries = [
+        (CAMERA + "depth/camera_info", T0, OTHER_INFO),
+        (COLOR_INFO, T0, camera_info()),
+        (COLOR + "/compressed", T0, png),
+    ]
+    frame = first(tmp_path, entries)
+    np.testing.assert_array_equal(frame.color, color_pixels(0))
+    assert frame.camera is not None
+    assert frame.camera.fx == 617.5
+
+
+def two_cameras() -> list[Entry]:
+    return [
+        color_at(1, topic=LEFT),
+        depth_at(1, topic=LEFT_DEPTH),
+        ("/left/color/camera_info", T0, camera_info()),
+        color_at(2, topic=RIGHT),
+        depth_at(2, topic=RIGHT_DEPTH),
+        ("/right/color/camera_info", T0, OTHER_INFO),
+    ]
+
+
+def test_of_several_cameras_one_must_be_chosen(tmp_path: Path) -> None:
+    text = refusal(tmp_path, two_cameras())
+    assert text == (
+        "several topics could be color; choose with "
+        f"--set source.color_topic={LEFT} or --set source.color_topic={RIGHT}"
+    )
+
+
+def test_the_depth_of_several_cameras_must_be_chosen_too(tmp_path: Path) -> None:
+    text = refusal(tmp_path, two_cameras(), color_topic=RIGHT)
+    assert f"--set source.depth_topic={RIGHT_DEPTH}" in text
+
+
+def test_named_topics_are_taken_as_they_are(tmp_path: Path) -> None:
+    frame = first(tmp_path, two_cameras(), color_topic=RIGHT, depth_topic=RIGHT_DEPTH)
+    np.testing.assert_array_equal(frame.color, color_pixels(2))
+    np.testing.assert_array_equal(frame.depth, depth_pixels(2))
+    assert frame.camera is not None
+    assert frame.camera.fx == 99
+
+
+def test_a_named_calibration_is_taken(tmp_path: Path) -> None:
+    entries = [*rgbd([0]), ("/elsewhere/calibration", T0, OTHER_INFO)]
+    frame = first(tmp_path, entries, camera_topic="/elsewhere/calibration")
+    assert frame.camera is not None
+    assert frame.camera.fx == 99
+
+
+@pytest.mark.parametrize("role", ["color", "depth", "camera"])
+def test_a_named_topic_that_is_not_there_gets_a_suggestion(role: str, tmp_path: Path) -> None:
+    text = refusal(tmp_path, rgbd([0]), **{f"{role}_topic": COLOR + "x"})
+    assert text == f"there is no topic '{COLOR}x'; did you mean '{COLOR}'?"
+
+
+@pytest.mark.parametrize(
+    ("role", "topic", "expected"),
+    [
+        ("color", COLOR_INFO, "foxglove.CompressedImage or foxglove.RawImage or sensor_msgs/msg/C"),
+        ("depth", COLOR_INFO, "foxglove.CompressedImage or foxglove.RawImage or sensor_msgs/msg/C"),
+        ("camera", COLOR, "foxglove.CameraCalibration or sensor_msgs/msg/CameraInfo"),
+    ],
+)
+def test_a_named_topic_of_another_type_is_refused(
+    role: str, topic: str, expected: str, tmp_path: Path
+) -> None:
+    text = refusal(tmp_path, rgbd([0]), **{f"{role}_topic": topic})
+    kind = "Image" if topic == COLOR else "CameraInfo"
+    assert text.startswith(f"topic '{topic}' holds sensor_msgs/msg/{kind}, expected {expected}")
+
+
+def test_unaligned_depth_is_refused_with_a_way_out(tmp_path: Path) -> None:
+    rect = raw_image(depth_pixels(0), "16UC1", frame_id="camera_depth_optical_frame")
+    text = refusal(tmp_path, [color_at(0), (RECT, T0 + 1, rect)])
+    assert text == (
+        f"depth ({RECT}) is in frame 'camera_depth_optical_frame', colour in "
+        "'camera_color_optical_frame': depth must be aligned to colour; record "
+        "aligned_depth_to_color, or play without depth: --set source.use_depth=false"
+    )
+
+
+def test_unaligned_depth_may_be_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    rect = raw_image(depth_pixels(0), "16UC1", frame_id="camera_depth_optical_frame")
+    entries = [(COLOR_INFO, T0, camera_info()), color_at(0), (RECT, T0 + 1, rect)]
+    assert first(tmp_path, entries, use_depth=False).depth is None
+    assert caplog.messages == [
+        "bag.mcap has no depth: positions, distances and diameters will be missing"
+    ]
+
+
+def test_rectified_depth_in_the_frame_of_the_colour_is_taken(tmp_path: Path) -> None:
+    # A D405 has one optical frame for both.
+    frame = first(tmp_path, [color_at(0), depth_at(0, topic=RECT)])
+    np.testing.assert_array_equal(frame.depth, depth_pixels(0))
+
+
+def test_aligned_depth_of_another_size_is_refused(tmp_path: Path) -> None:
+    small = raw_image(depth_pixels(0, (4, 3)), "16UC1")
+    text = refusal(tmp_path, [color_at(0), (ALIGNED, T0 + 1, small)])
+    assert "frame 0: depth has shape (3, 4), colour (6, 8)" in text
