@@ -13,6 +13,9 @@ F = TypeVar("F", bound=Callable[..., Any])
 def jit(function: F) -> F:
     """Compile a kernel on first use; on a machine without a writable cache, in every process."""
     try:
-        return cast(F, njit(cache=True, nogil=True, fastmath=True)(function))
+        return cast(
+            F,
+            njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp", "nsz"})(function),
+        )
     except RuntimeError:  # numba found no folder it may write to
-        return cast(F, njit(nogil=True, fastmath=True)(function))
+        return cast(F, njit(nogil=True, fastmath={"reassoc", "contract", "arcp", "nsz"})(function))

@@ -10,10 +10,12 @@ from pydantic import Field, model_validator
 
 from mushpipe import Mask, RgbdFrame, Stage
 from mushpipe.stages.channels import Channel, channel_image
-from mushpipe.stages.otsu import otsu_foreground
+from mushpipe.stages.otsu import initial_contour
+from mushpipe.stages.polarity import rise
 
 Plane = NDArray[np.float32]
 Region = NDArray[np.bool_]
+SUNKEN_M = 0.003  # a bright side that lies this much lower is the bed
 
 
 class ChanVese(Stage):
@@ -26,6 +28,12 @@ class ChanVese(Stage):
 
     solver: Literal["fast", "pde", "morphological"] = Field("fast", description="how to minimise")
     channel: Channel = Field("gray", description="what it looks at; the paper found gray best")
+    polarity: Literal["auto", "bright", "dark"] = Field(
+        "auto", description="what caps are; auto: bright, unless depth shows the dark side nearer"
+    )
+    check: bool = Field(
+        True, description="empty mask where there are no two classes; false is plain Otsu"
+    )
     mu: float = Field(0.1, gt=0, description="weight of the contour's length, on gray in 0..1")
     iterations: int = Field(100, ge=1, description="most iterations of `pde` and `morphological`")
     smoothing: int = Field(1, ge=0, description="`morphological`: curvature steps per iteration")
@@ -47,7 +55,12 @@ class ChanVese(Stage):
     def process(self, frame: RgbdFrame) -> Mask:
         """Return the mask with the contour it started from."""
         image = channel_image(frame, self.channel)
-        initial = otsu_foreground(image.mean(axis=2) if image.ndim == 3 else image)
+        if self.polarity == "dark":
+            image = 1 - image
+        initial = initial_contour(image, self.check)
+        if self.polarity == "auto" and frame.depth is not None and rise(frame, initial) < -SUNKEN_M:
+            image = 1 - image
+            initial = initial_contour(image, self.check)
         if not initial.any() or initial.all():
             return Mask(initial, initial)
         return Mask(self.solve(image, initial), initial)

@@ -21,6 +21,7 @@ from mushpipe.core.jit import jit
 
 Plane = NDArray[np.float32]
 Planes = NDArray[np.float32]
+Levels = tuple[float, float]
 SIGMA = 1.5
 _TAPS = np.exp(-(np.arange(-3, 4) ** 2) / (2 * SIGMA**2)).astype(np.float32)
 _TAPS /= _TAPS.sum()
@@ -132,8 +133,9 @@ def icm_sweep(image: Plane, u: Plane, gain: float, offset: float, mu: float) -> 
 class _Regions:
     """The two means of a region, and the force they exert on each pixel."""
 
-    def __init__(self, planes: Planes, u: Plane) -> None:
+    def __init__(self, planes: Planes, u: Plane, levels: Levels | None) -> None:
         self.planes = planes
+        self.levels = levels
         self.update(u)
 
     def update(self, u: Plane) -> None:
@@ -143,6 +145,8 @@ class _Regions:
         self.c1 = np.array([total / max(1, self.inside) for _, total, _ in sums])
         self.c2 = np.array([(everything - total) / outside for _, total, everything in sums])
         self.one_sided = self.inside in (0, u.size)
+        if self.levels is not None:
+            self.c1, self.c2 = (np.full(len(sums), level) for level in self.levels)
 
     def force(self) -> tuple[Plane, float, float]:
         """Return P, gain and offset of |I - c2|^2 - |I - c1|^2 = gain P + offset."""
@@ -157,7 +161,8 @@ def solve_fast(
     image: Plane,
     initial: NDArray[np.bool_],
     mu: float,
-    levels: int = 5,
+    levels: Levels | None = None,
+    depth: int = 5,
     iterations: int = 3,
     sweeps: int = 2,
 ) -> NDArray[np.bool_]:
@@ -167,14 +172,15 @@ def solve_fast(
         image: (H, W) or (H, W, C) in 0..1.
         initial: (H, W) region to start from.
         mu: Weight of the length.
-        levels: Levels of the pyramid, the full resolution among them.
+        levels: c1 and c2 where they are known; else they are the means of the two sides.
+        depth: Levels of the pyramid, the full resolution among them.
         iterations: Most ICTM iterations at full resolution, doubled per level; fewer where nothing
             moves any more.
         sweeps: Most sweeps of descent on the contour, at full resolution.
     """
     planes = np.ascontiguousarray(np.moveaxis(image, -1, 0) if image.ndim == 3 else image[None])
-    u = _pyramid(planes, initial.astype(np.float32), mu, levels, iterations)
-    regions = _Regions(planes, u)
+    u = _pyramid(planes, initial.astype(np.float32), mu, levels, depth, iterations)
+    regions = _Regions(planes, u, levels)
     for _ in range(sweeps):
         if regions.one_sided:
             break
@@ -185,20 +191,22 @@ def solve_fast(
     return u > 0
 
 
-def _pyramid(planes: Planes, u: Plane, mu: float, levels: int, iterations: int) -> Plane:
+def _pyramid(
+    planes: Planes, u: Plane, mu: float, levels: Levels | None, depth: int, iterations: int
+) -> Plane:
     """Solve at half resolution first, with mu / 2: the length halves while the area quarters."""
     height, width = u.shape
-    if levels > 1 and min(height, width) >= 32:
+    if depth > 1 and min(height, width) >= 32:
         half = (width // 2, height // 2)
         small = np.stack([cv2.resize(p, half, interpolation=cv2.INTER_AREA) for p in planes])
         start = cv2.resize(u, half, interpolation=cv2.INTER_AREA).round()
-        solved = _pyramid(small, start, mu / 2, levels - 1, 2 * iterations)
+        solved = _pyramid(small, start, mu / 2, levels, depth - 1, 2 * iterations)
         u = cv2.resize(solved, (width, height)).round()
-    return _ictm(planes, u, mu, iterations)
+    return _ictm(planes, u, mu, levels, iterations)
 
 
-def _ictm(planes: Planes, u: Plane, mu: float, iterations: int) -> Plane:
-    regions, other = _Regions(planes, u), np.empty_like(u)
+def _ictm(planes: Planes, u: Plane, mu: float, levels: Levels | None, iterations: int) -> Plane:
+    regions, other = _Regions(planes, u, levels), np.empty_like(u)
     pull = mu * math.sqrt(2 * math.pi) / SIGMA
     for _ in range(iterations):
         if regions.one_sided:

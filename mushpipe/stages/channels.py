@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe import RgbdFrame
+from mushpipe.stages.evidence import BELIEVED, believed_foreground
 
 Channel = Literal["gray", "rgb", "a", "red-blue", "auto"]
 Plane = NDArray[np.float32]
-_CANDIDATES: tuple[Channel, ...] = ("gray", "a", "red-blue")
-_THUMBNAIL = (160, 120)
+Region = NDArray[np.bool_]
 
 
 def channel_image(frame: RgbdFrame, channel: Channel) -> Plane:
@@ -21,39 +21,52 @@ def channel_image(frame: RgbdFrame, channel: Channel) -> Plane:
 
     ``a`` is the green-to-red axis of CIE Lab and ``red-blue`` the difference of both channels,
     each blurred by 1 px and stretched to 0..1 between its extremes: soil and brown caps of one
-    brightness differ there. ``auto`` takes the one of them or gray with the largest separability.
+    brightness differ there. ``auto`` is `best_image`.
     """
     if channel == "auto":
-        thumbnail = cv2.resize(frame.color, _THUMBNAIL, interpolation=cv2.INTER_AREA)
-        scores = {name: separability(_plane(thumbnail, name)) for name in _CANDIDATES}
-        channel = max(_CANDIDATES, key=lambda name: scores[name])
+        return best_image(frame)
     if channel == "gray":
         return np.asarray(frame.gray, np.float32)
     if channel == "rgb":
         return np.asarray(frame.color * np.float32(1 / 255), np.float32)
-    return _plane(cv2.GaussianBlur(frame.color, (5, 5), 1.0), channel)
-
-
-def _plane(color: NDArray[np.uint8], channel: Channel) -> Plane:
-    if channel == "gray":
-        gray = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
-        return np.asarray(gray * np.float32(1 / 255), np.float32)
+    color = cv2.GaussianBlur(frame.color, (5, 5), 1.0)
     if channel == "a":
-        plane = cv2.cvtColor(color, cv2.COLOR_RGB2LAB)[..., 1].astype(np.float32)
+        plane = cv2.extractChannel(cv2.cvtColor(color, cv2.COLOR_RGB2LAB), 1).astype(np.float32)
     else:
         plane = color[..., 0].astype(np.float32) - color[..., 2]
     low, high = float(plane.min()), float(plane.max())
     return np.asarray((plane - low) / max(high - low, 1e-6), np.float32)
 
 
-def separability(image: Plane) -> float:
-    """Return Otsu's criterion: the largest share of the variance that two classes explain, 0..1."""
-    levels = np.bincount(np.rint(image.ravel() * 255).astype(np.uint8), minlength=256)
-    share = levels / levels.sum()
-    value = np.arange(256)
-    weight, first = np.cumsum(share), np.cumsum(share * value)
-    mean = first[-1]
-    variance = (share * (value - mean) ** 2).sum()
-    with np.errstate(divide="ignore", invalid="ignore"):
-        between = (mean * weight - first) ** 2 / (weight * (1 - weight))
-    return float(np.nanmax(between) / variance) if variance > 0 else 0.0
+def best_image(frame: RgbdFrame) -> Plane:
+    """Return gray, a colour channel, or their joint membership, whichever the evidence speaks for.
+
+    A colour channel counts where its own split is clearly believed and agrees with that of gray:
+    on a wooden table the wood stands out in colour, but nowhere that is bright. It replaces gray
+    where it holds most of what gray finds; where it holds part, as on a bed of white and brown
+    caps, a pixel is as much cap as the one that says more.
+    """
+    gray = channel_image(frame, "gray")
+    bright, known = believed_foreground(gray)
+    best, chosen = known, (gray, bright)
+    for name in ("a", "red-blue"):
+        image = channel_image(frame, name)
+        region, found = believed_foreground(image)
+        if found > max(best, 1.25 * BELIEVED) and _agrees(region, bright) > 0.3:
+            best, chosen = found, (image, region)
+    image, region = chosen
+    if image is gray or _agrees(region, bright) > 0.7:
+        return image
+    return np.maximum(_membership(gray, bright), _membership(image, region))
+
+
+def _agrees(region: Region, bright: Region) -> float:
+    """Return the share of the bright region that a region holds; 1 where nothing is bright."""
+    count = int(np.count_nonzero(bright))
+    return float(np.count_nonzero(region & bright) / count) if count else 1.0
+
+
+def _membership(image: Plane, region: Region) -> Plane:
+    """Return how much a pixel belongs to a region, 0.5 midway between the means of the sides."""
+    c1, c2 = float(image[region].mean()), float(image[~region].mean())
+    return np.asarray(np.clip((image - c2) / (c1 - c2), 0, 1), np.float32)

@@ -1,8 +1,8 @@
 """Illumination: a smooth light field fitted together with the two classes, and divided out.
 
 The logarithm of the image is modelled as a level per class plus a quadratic light field (the
-bias field of Wells et al. 1996 and Li et al. 2011, with the two phases of Chan-Vese). The classes are
-part of the fit because dividing by a local mean would take dense caps for light.
+bias field of Wells et al. 1996 and Li et al. 2011, with the two phases of Chan-Vese). The classes
+are part of the fit because dividing by a local mean would take dense caps for light.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from pydantic import Field
 
 from mushpipe import RgbdFrame, Stage
 from mushpipe.core.jit import jit
+from mushpipe.stages.linear import least_squares
 from mushpipe.stages.otsu import otsu_foreground
 
 Plane = NDArray[np.float32]
@@ -58,14 +59,14 @@ def light_field(gray: Plane, iterations: int) -> Plane:
     for _ in range(iterations):
         if u.all() or not u.any():
             break
-        columns = np.column_stack([u, ~u, basis])
-        solution = np.linalg.lstsq(columns, h.ravel(), rcond=None)[0]
-        field = basis @ solution[2:]
+        columns = np.column_stack([u, ~u, basis]).astype(np.float64)
+        solution = least_squares(columns, h.ravel())
+        field = np.einsum("mk,k->m", basis, solution[2:])
         new = h.ravel() - field > solution[:2].mean()
         if np.array_equal(new, u):
             break
         u = new
-    return (field - field.mean()).reshape(gray.shape).astype(np.float32)
+    return np.asarray((field - field.mean()).reshape(gray.shape), np.float32)
 
 
 def _quadratic(height: int, width: int) -> NDArray[np.float64]:
