@@ -122,10 +122,10 @@ def solve_morphological(
     width = image.shape[1]
     words = pack(initial)
     tail = np.uint64(2 ** ((width - 1) % 64 + 1) - 1)
-    before, flip = words, False
+    before, flip = np.zeros_like(words[:0]), False
     everything = float(image.sum(dtype=np.float64))
     count, total = int(initial.sum()), float(image[initial].sum(dtype=np.float64))
-    for _ in range(iterations):
+    for done in range(1, iterations + 1):
         if count in (0, image.size):
             break
         c1, c2 = total / count, (everything - total) / (image.size - count)
@@ -139,9 +139,10 @@ def solve_morphological(
         grown, added = change_of_region(image, words, evolved)
         count, total = count + grown, total + added
         # The operators alternate, so a region at rest may swing between two states.
-        if np.array_equal(evolved, before):
-            break
+        at_rest = np.array_equal(evolved, before)
         before, words = words, evolved
+        if at_rest:
+            return unpack(words if (iterations - done) % 2 == 0 else before, width)
     return unpack(words, width)
 
 
