@@ -57,12 +57,16 @@ class ChanVese(Stage):
         image = channel_image(frame, self.channel)
         if self.polarity == "dark":
             image = 1 - image
-        initial = initial_contour(image, self.check)
-        if self.polarity == "auto" and frame.depth is not None and rise(frame, initial) < -SUNKEN_M:
+        found = initial_contour(image, self.check)
+        auto = self.polarity == "auto" and frame.depth is not None
+        if auto and rise(frame, found.region) < -SUNKEN_M:
             image = 1 - image
-            initial = initial_contour(image, self.check)
+            found = initial_contour(image, self.check)
+        initial = found.region
         if not initial.any() or initial.all():
             return Mask(initial, initial)
+        if found.floor and image.ndim == 2:  # two phases, not bed, mycelium and caps
+            image = np.maximum(image, np.float32(found.floor))
         return Mask(self.solve(image, initial), initial)
 
     def solve(self, image: Plane, initial: Region) -> Region:

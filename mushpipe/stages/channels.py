@@ -47,11 +47,11 @@ def best_image(frame: RgbdFrame) -> Plane:
     caps, a pixel is as much cap as the one that says more.
     """
     gray = channel_image(frame, "gray")
-    bright, known = believed_foreground(gray)
+    bright, known, _ = believed_foreground(gray)
     best, chosen = known, (gray, bright)
     for name in ("a", "red-blue"):
         image = channel_image(frame, name)
-        region, found = believed_foreground(image)
+        region, found, _ = believed_foreground(image)
         if found > max(best, 1.25 * BELIEVED) and _agrees(region, bright) > 0.3:
             best, chosen = found, (image, region)
     image, region = chosen

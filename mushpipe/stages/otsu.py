@@ -9,7 +9,7 @@ from pydantic import Field
 
 from mushpipe import Mask, RgbdFrame, Stage
 from mushpipe.stages.channels import Channel, channel_image
-from mushpipe.stages.evidence import believed_foreground
+from mushpipe.stages.evidence import Evidence, believed_foreground
 
 
 def otsu_foreground(gray: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -24,10 +24,10 @@ def otsu_foreground(gray: NDArray[np.float32]) -> NDArray[np.bool_]:
     return np.asarray(binary, np.uint8).view(np.bool_)
 
 
-def initial_contour(image: NDArray[np.float32], check: bool) -> NDArray[np.bool_]:
+def initial_contour(image: NDArray[np.float32], check: bool) -> Evidence:
     """Return Otsu's foreground of an (H, W[, C]) image, or with ``check`` the believed one."""
     plane = image if image.ndim == 2 else np.ascontiguousarray(image.mean(axis=2))
-    return believed_foreground(plane)[0] if check else otsu_foreground(plane)
+    return believed_foreground(plane) if check else Evidence(otsu_foreground(plane), 0.0, 0.0)
 
 
 class Otsu(Stage):
@@ -40,5 +40,5 @@ class Otsu(Stage):
 
     def process(self, frame: RgbdFrame) -> Mask:
         """Return the mask; it is its own initial contour."""
-        foreground = initial_contour(channel_image(frame, self.channel), self.check)
+        foreground = initial_contour(channel_image(frame, self.channel), self.check).region
         return Mask(foreground, initial=foreground)
