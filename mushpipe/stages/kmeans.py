@@ -13,7 +13,7 @@ from mushpipe import Mask, RgbdFrame, Stage
 class KMeans(Stage):
     """Segments by k-means on gray levels: caps are the brightest of the clusters.
 
-    With two clusters it is Otsu's threshold by another way; more clusters separate mycelium from
+    With two clusters it is Otsu's threshold by another road; more clusters separate mycelium from
     caps on a dark bed, and cut shaded rims off. Nothing tells it that a bed is empty.
     """
 
@@ -29,23 +29,30 @@ class KMeans(Stage):
 
 
 def thresholds(histogram: NDArray[np.float64], clusters: int) -> NDArray[np.float64]:
-    """Return the (clusters - 1,) levels between the clusters of a histogram, by Lloyd's iteration.
+    """Return the (clusters - 1,) last levels of all but the brightest cluster of a histogram.
 
-    The first centres are the means of equal shares of the pixels, so there is nothing random in it.
+    On a line the clusters are intervals, so dynamic programming finds the exact minimum of the
+    squared distances to the means (Fisher 1958), where Lloyd's iteration may end in a local one.
     """
+    cost = interval_costs(histogram)
+    n = len(histogram)
+    best, starts = cost[0], []
+    for _ in range(clusters - 1):
+        # Row i: the last cluster starts at level i, those before end at i - 1.
+        total = np.concatenate([[np.inf], best[:-1]])[:, None] + cost
+        starts.append(total.argmin(axis=0))
+        best = total.min(axis=0)
+    end, found = n - 1, []
+    for start in reversed(starts):
+        end = int(start[end]) - 1
+        found.append(end)
+    return np.array(found[::-1], np.float64)
+
+
+def interval_costs(histogram: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (n, n): the sum of squares about their mean of levels i to j; infinite for j < i."""
     value = np.arange(len(histogram))
-    rank = np.cumsum(histogram) / histogram.sum()
-    label = np.minimum((rank * clusters - 1e-9).astype(int), clusters - 1)
-    middle = np.zeros(clusters - 1)
-    for _ in range(100):
-        weight = np.bincount(label, histogram, clusters)
-        total = np.bincount(label, histogram * value, clusters)
-        # A cluster that lost all its pixels stays between its neighbours.
-        center = np.where(weight > 0, total / np.maximum(weight, 1e-12), np.nan)
-        center = np.interp(np.arange(clusters), np.flatnonzero(weight > 0), center[weight > 0])
-        new = (center[1:] + center[:-1]) / 2
-        if np.array_equal(new, middle):
-            break
-        middle = new
-        label = np.searchsorted(middle, value, side="left")
-    return middle
+    sums = [np.cumsum([0.0, *(histogram * value**k)]) for k in range(3)]
+    count, first, second = (s[None, 1:] - s[:-1, None] for s in sums)
+    spread = second - np.divide(first**2, count, out=np.zeros_like(count), where=count > 0)
+    return np.where(value[None] >= value[:, None], np.maximum(spread, 0), np.inf)

@@ -52,14 +52,14 @@ def test_spheres_on_a_tilted_plane(tilt: float, relief: bool) -> None:
 
 
 def test_spheres_on_a_bumpy_plane_need_the_relief() -> None:
-    bumps = 0.010 * np.sin(U / 45) * np.cos(V / 40)
+    bumps = 0.006 * np.sin(U / 45) * np.cos(V / 40)
     depth, truth = scene(plane(5) + bumps)
     plain, bent = (
         iou(Height(relief=relief).process(frame_of(depth)).foreground, truth)
         for relief in (False, True)
     )
-    assert bent > 0.85
-    assert bent > plain + 0.05
+    assert bent > 0.95
+    assert bent > plain + 0.1
 
 
 def test_the_bed_is_the_plane_that_was_put_in() -> None:
@@ -67,8 +67,9 @@ def test_the_bed_is_the_plane_that_was_put_in() -> None:
     depth, truth = scene(bed)
     found = bed_depth(depth.astype(np.float32))
     assert found is not None
-    assert np.abs(found - bed)[~truth].max() < 0.004
-    assert np.median(np.abs(found - bed)) < 0.0015
+    # It follows the far side: of the noise, and of each cell of the slope.
+    assert -0.001 < np.median(found - bed) < 0.0035
+    assert np.abs(found - bed)[~truth].max() < 0.006
 
 
 def test_holes_and_shadows_are_filled() -> None:
