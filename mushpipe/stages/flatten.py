@@ -20,7 +20,10 @@ from mushpipe.stages.linear import least_squares
 from mushpipe.stages.otsu import otsu_foreground
 
 Plane = NDArray[np.float32]
-_DARK = 6.0  # keeps the logarithm of black finite and its noise small, on 0..255
+_DARK = 2.0  # keeps the logarithm of black finite, on 0..255
+# Noise in the logarithm goes with the inverse of brightness: what is darker than this counts
+# little. The gaps of a real bed are black in any light.
+_DIM = 20.0
 
 
 class Flatten(Stage):
@@ -55,12 +58,12 @@ def light_field(gray: Plane, iterations: int) -> Plane:
     if high - low < 1e-6:
         return np.zeros(gray.shape, np.float32)
     u = otsu_foreground((detail - low) / (high - low)).ravel()
-    field = np.zeros(h.size)
+    field, weight = np.zeros(h.size), np.asarray(gray / (gray + _DIM), np.float64).ravel() + 1e-3
     for _ in range(iterations):
         if u.all() or not u.any():
             break
         columns = np.column_stack([u, ~u, basis]).astype(np.float64)
-        solution = least_squares(columns, h.ravel())
+        solution = least_squares(columns, h.ravel(), weight)
         field = np.einsum("mk,k->m", basis, solution[2:])
         new = h.ravel() - field > solution[:2].mean()
         if np.array_equal(new, u):

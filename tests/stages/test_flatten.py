@@ -9,7 +9,7 @@ from hypothesis.extra.numpy import arrays
 from mushpipe import RgbdFrame
 from mushpipe.stages.chan_vese import ChanVese
 from mushpipe.stages.flatten import Flatten, apply_gain, light_field
-from tests.stages.frames import iou, simulated, truth_of
+from tests.stages.frames import iou, recorded, simulated, truth_of
 from tests.stages.scenes import HEADER
 
 V, U = np.mgrid[:240, :320]
@@ -30,9 +30,10 @@ def found(frame: RgbdFrame) -> np.ndarray:
 @pytest.mark.parametrize("strength", [0.5, 0.75, 0.95])
 @pytest.mark.parametrize("angle", [0.0, 0.7, 2.0])
 def test_a_gradient_of_light_costs_next_to_nothing(strength: float, angle: float) -> None:
-    along = (np.cos(angle) * (U / 319 - 0.5) + np.sin(angle) * (V / 239 - 0.5)) + 0.5
+    along = np.cos(angle) * U / 319 + np.sin(angle) * V / 239
+    along = (along - along.min()) / np.ptp(along)
     even = iou(found(lit(np.ones((240, 320)))), CAPS)
-    graded = iou(found(lit(1 - strength * np.clip(along, 0, 1))), CAPS)
+    graded = iou(found(lit(1 - strength * along)), CAPS)
     assert even > 0.98
     assert graded >= even - 0.02
 
@@ -59,6 +60,22 @@ def test_depth_and_calibration_are_handed_on() -> None:
     assert np.ptp(ratio) < 0.05
 
 
+def test_black_gaps_are_not_taken_for_a_lack_of_light() -> None:
+    frame = lit(np.ones((240, 320)))
+    color = frame.color.copy()
+    color[:, 200:][~CAPS[:, 200:]] = 0
+    gapped = RgbdFrame(HEADER, color)
+    assert iou(found(gapped), CAPS) > 0.98
+    gain = Flatten().process(gapped).gray[CAPS].mean() / gapped.gray[CAPS].mean()
+    assert gain == pytest.approx(1, abs=0.1)
+
+
+@pytest.mark.parametrize("name", ["white-bed-0", "beds-colour-only"])
+def test_real_beds_in_even_light_stay_as_they_are(name: str) -> None:
+    for frame in recorded(name):
+        assert iou(found(frame), ChanVese().process(frame).foreground) > 0.9
+
+
 @pytest.mark.parametrize("level", [0, 100, 255])
 def test_an_image_of_one_level_is_handed_on_as_it_is(level: int) -> None:
     frame = RgbdFrame(HEADER, np.full((120, 160, 3), level, np.uint8))
@@ -69,7 +86,7 @@ def test_the_field_is_that_which_was_put_in() -> None:
     y, x = np.mgrid[-1:1:60j, -1:1:80j]
     truth = 0.4 * x - 0.2 * y + 0.15 * x * y - 0.2 * x * x
     caps = np.any([(x - a) ** 2 + (y - b) ** 2 < 0.05 for a, b in ((-0.5, 0.2), (0.4, -0.3))], 0)
-    gray = np.exp(truth + np.where(caps, np.log(206), np.log(56))) - 6
+    gray = np.exp(truth + np.where(caps, np.log(206), np.log(56))) - 2
     field = light_field(gray.astype(np.float32), 6)
     np.testing.assert_allclose(field, truth - truth.mean(), atol=0.01)
 
