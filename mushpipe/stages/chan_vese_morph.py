@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
+from mushpipe.stages.chan_vese_fast import region_sums
 
 Words = NDArray[np.uint64]
 Plane = NDArray[np.float32]
@@ -22,8 +23,10 @@ Plane = NDArray[np.float32]
 def pack(mask: NDArray[np.bool_]) -> Words:
     """Pack an (H, W) mask into (H, ceil(W / 64)) words, the leftmost pixel in the lowest bit."""
     height, width = mask.shape
-    padded = np.zeros((height, -(-width // 64) * 64), np.uint8)
-    padded[:, :width] = mask
+    padded = mask.view(np.uint8)
+    if width % 64:
+        padded = np.zeros((height, -(-width // 64) * 64), np.uint8)
+        padded[:, :width] = mask
     return np.packbits(padded, axis=1, bitorder="little").view(np.uint64)
 
 
@@ -99,6 +102,10 @@ def change_of_region(image: Plane, old: Words, new: Words) -> tuple[int, float]:
             changed = old[y, k] ^ new[y, k]
             x = 64 * k
             while changed != np.uint64(0):
+                if changed & np.uint64(255) == np.uint64(0):  # changes are few and far between
+                    changed >>= np.uint64(8)
+                    x += 8
+                    continue
                 if changed & np.uint64(1) and x < width:
                     sign = 1 if (new[y, k] >> np.uint64(x - 64 * k)) & np.uint64(1) else -1
                     count += sign
@@ -123,8 +130,7 @@ def solve_morphological(
     words = pack(initial)
     tail = np.uint64(2 ** ((width - 1) % 64 + 1) - 1)
     before, flip = np.zeros_like(words[:0]), False
-    everything = float(image.sum(dtype=np.float64))
-    count, total = int(initial.sum()), float(image[initial].sum(dtype=np.float64))
+    count, total, everything = region_sums(image, initial.astype(np.float32))
     for done in range(1, iterations + 1):
         if count in (0, image.size):
             break

@@ -56,7 +56,7 @@ def believed_foreground(image: Plane) -> Evidence:
         region = np.asarray(levels > level)
         small = halved(region)
         strength = contrast(histogram, level) * compactness(small) ** 0.5
-        if strength >= BELIEVED and edge_step(image, small) >= STEP:
+        if strength >= BELIEVED and edge_step(levels, small) >= STEP:
             return Evidence(region, strength, _mean(histogram, start, level) if start else 0.0)
         start = level + 1
     return Evidence(np.zeros(image.shape, bool), 0.0, 0.0)
@@ -116,11 +116,11 @@ def compactness(small: Bits) -> float:
     return float(survives / max(1, cv2.countNonZero(small)))
 
 
-def edge_step(image: Plane, small: Bits) -> float:
+def edge_step(image: Plane | Bits, small: Bits) -> float:
     """Return which share of the difference between two sides is crossed at their contour.
 
     Args:
-        image: (H, W) in 0..1.
+        image: (H, W), of any scale.
         small: The region at half resolution; specks and pinholes have no part in its contour,
             or noise would, which always steps at its threshold.
 
