@@ -12,6 +12,7 @@ from mushpipe.stages.bed import bed_depth
 from mushpipe.stages.chan_vese_fast import solve_fast
 
 Plane = NDArray[np.float32]
+REACH_PX = 32  # the widest gap that one side can fill: a shadow, or half of a shiny cap
 
 
 class Height(Stage):
@@ -62,20 +63,21 @@ def height_image(height: Plane, middle: float, highest: float) -> Plane:
 
 @jit
 def filled(height: Plane) -> Plane:
-    """Fill missing values from the nearest known on the four sides, weighted by 1 / distance.
+    """Fill missing values from what is known on the four sides.
 
-    Beside a cap that is its own side of a shadow; within a cap it is the cap. Where a row and a
-    column know nothing the value is 0, the level of the bed.
+    Of two opposite sides the lower counts: between a cap and the bed lies a shadow on the bed,
+    within a cap there is the cap on both sides. What is not known within 32 px counts as bed, 0.
+    Of the row and the column it is the mean.
     """
     rows, columns = height.shape
-    total = np.zeros((rows, columns), np.float32)
-    weight = np.zeros((rows, columns), np.float32)
+    result = height.copy()
+    earlier = np.zeros((2, rows, columns), np.float32)
     for direction in range(2):
         last = np.zeros(columns, np.float32)
-        age = np.full(columns, np.inf, np.float32)
+        age = np.full(columns, REACH_PX, np.float32)
         for step in range(rows):
             y = step if direction == 0 else rows - 1 - step
-            side, since = np.float32(0), np.float32(np.inf)
+            side, since = np.float32(0), np.float32(REACH_PX)
             for k in range(columns):
                 x = k if direction == 0 else columns - 1 - k
                 value = height[y, x]
@@ -85,12 +87,11 @@ def filled(height: Plane) -> Plane:
                     continue
                 age[x] += np.float32(1)
                 since += np.float32(1)
-                total[y, x] += last[x] / age[x] + side / since
-                weight[y, x] += np.float32(1) / age[x] + np.float32(1) / since
-    result = height.copy()
-    for y in range(rows):
-        for x in range(columns):
-            if not np.isfinite(result[y, x]):
-                w = weight[y, x]
-                result[y, x] = total[y, x] / w if w > 0 else np.float32(0)
+                above = last[x] if age[x] <= REACH_PX else np.float32(0)
+                beside = side if since <= REACH_PX else np.float32(0)
+                if direction == 0:
+                    earlier[0, y, x], earlier[1, y, x] = above, beside
+                else:
+                    lower = min(above, earlier[0, y, x]) + min(beside, earlier[1, y, x])
+                    result[y, x] = np.float32(0.5) * lower
     return result

@@ -131,15 +131,24 @@ def test_far_cells_are_the_far_percentile() -> None:
     assert far[1, 2] == looked_at[int(0.9 * (looked_at.size - 1))]
 
 
-def test_filling_weighs_the_four_sides_by_distance() -> None:
+def test_filling_takes_the_lower_of_opposite_sides() -> None:
     height = np.full((5, 7), np.nan, np.float32)
-    height[2, 0], height[2, 6], height[0, 2] = 1.0, 4.0, 2.0
+    height[2, 0], height[2, 6], height[0, 2], height[4, 2] = 1.0, 4.0, 2.0, 3.0
     full = filled(height)
-    # Left at 2 px, right at 4 px, above at 2 px; nothing below.
-    weights = np.array([1 / 2, 1 / 4, 1 / 2])
-    assert full[2, 2] == pytest.approx((weights @ [1.0, 4.0, 2.0]) / weights.sum())
+    assert full[2, 2] == pytest.approx((min(1.0, 4.0) + min(2.0, 3.0)) / 2)
     assert full[4, 4] == 0
+    assert full[2, 4] == pytest.approx(min(1.0, 4.0) / 2)
     assert (full[np.isfinite(height)] == height[np.isfinite(height)]).all()
+
+
+def test_filling_reaches_no_farther_than_a_shadow() -> None:
+    height = np.full((3, 200), np.nan, np.float32)
+    height[:, 0] = height[:, 199] = 0.05
+    assert (filled(height)[:, 33:167] == 0).all()
+    depth, truth = scene(plane(5))
+    depth[:, 240:] = np.nan
+    found = Height().process(frame_of(depth)).foreground
+    assert not found[:, 250:].any()
 
 
 @pytest.mark.parametrize("seed", [203, 204])
