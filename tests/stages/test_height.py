@@ -145,7 +145,7 @@ def test_filling_reaches_no_farther_than_a_shadow() -> None:
     height = np.full((3, 200), np.nan, np.float32)
     height[:, 0] = height[:, 199] = 0.05
     assert (filled(height)[:, 33:167] == 0).all()
-    depth, truth = scene(plane(5))
+    depth, _ = scene(plane(5))
     depth[:, 240:] = np.nan
     found = Height().process(frame_of(depth)).foreground
     assert not found[:, 250:].any()
