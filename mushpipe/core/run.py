@@ -73,7 +73,10 @@ class _Runner:
         source = self.plan.source.plugin
         if not isinstance(source, Source):
             raise TypeError("the plan's source is not a Source")
-        info = RunInfo(source.name(), build_manifest(self.plan))
+        reader = SourceThread(self.plan.source, source, threading.Event())
+        info = RunInfo(
+            source.name(), build_manifest(self.plan), source.live, lambda: reader.box.accepted
+        )
         with ExitStack() as stack:
             stack.enter_context(_opened(self.plan.source, _opener(self.plan.source)))
             for node in self.plan.stages:
@@ -81,7 +84,6 @@ class _Runner:
             for node in self.plan.sinks:
                 stack.enter_context(_opened(node, _opener(node, info)))
             threads = [self._sink_thread(node) for node in self.plan.sinks]
-            reader = SourceThread(self.plan.source, source, threading.Event())
             try:
                 self._loop(reader, threads)
             finally:
