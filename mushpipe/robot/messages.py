@@ -8,7 +8,7 @@ from importlib import resources
 from typing import Annotated, Any, Literal
 
 import orjson
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
 
 PROTOCOL = "mushpipe-robot"
 VERSION = "1.0"
@@ -16,7 +16,14 @@ MAX_LINE = 65_536
 NAME = r"^[A-Za-z0-9_.-]{0,64}$"
 HEARTBEAT_S = 1.0
 
-Id = Annotated[int, Field(ge=0, le=2**53 - 1)] | Annotated[str, Field(max_length=64)]
+
+def _whole(value: Any) -> Any:
+    """Take 7.0 for 7, as JSON does; some controllers know only one kind of number."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+Whole = Annotated[int, BeforeValidator(_whole)]
+Id = Annotated[Whole, Field(ge=0, le=2**53 - 1)] | Annotated[str, Field(max_length=64)]
 State = Literal["running", "stalled", "no_camera"]
 Code = Literal[
     "bad_json",
@@ -69,8 +76,8 @@ class GetTargets(_Message):
 
     op: Literal["get_targets"]
     id: Id
-    max: int = Field(1000, ge=1, le=1000)
-    max_age_ms: int | None = Field(None, ge=1, le=600_000)
+    max: Whole = Field(1000, ge=1, le=1000)
+    max_age_ms: Whole | None = Field(None, ge=1, le=600_000)
     frame: str | None = Field(None, max_length=64)
 
 
@@ -81,7 +88,7 @@ class Ack(_Message):
     id: Id
     target: str = Field(pattern=r"^m[0-9]{1,15}$")
     result: Literal["accepted", "rejected", "done", "failed"]
-    hold_ms: int = Field(0, ge=0, le=3_600_000)
+    hold_ms: Whole = Field(0, ge=0, le=3_600_000)
     reason: str = Field("", max_length=200)
 
 
@@ -134,7 +141,7 @@ def parse(line: bytes) -> Inbound:
 
 
 def _identity(body: Mapping[str, Any]) -> dict[str, Any]:
-    value = body.get("id")
+    value = _whole(body.get("id"))
     whole = isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**53
     short = isinstance(value, str) and len(value) <= 64
     return {"id": value} if whole or short else {}
