@@ -60,6 +60,7 @@ class Placer:
         self._spans[-1].end = last.end = now
         while self._spans[0].end < now - MEMORY_S:
             self._spans.popleft()
+        self._spans[0].begin = max(self._spans[0].begin, now - MEMORY_S)
         return now
 
     def place(self, stamp_ns: int) -> float | None:

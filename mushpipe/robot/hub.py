@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import uuid
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -155,7 +156,7 @@ class Hub:
             "frame_number": result.frame_number,
             "stamp": {"sec": result.stamp_ns // 10**9, "nsec": result.stamp_ns % 10**9},
             "age_ms": _ceil_ms(age),
-            "valid_ms": max(0, int((limit - age) * 1000)),
+            "valid_ms": max(0, math.floor(round((limit - age) * 1000, 3))),
             "frame": result.choice.frame,
             **self.envelope(now),
             "withheld": withheld,
@@ -195,4 +196,5 @@ class Hub:
 
 
 def _ceil_ms(seconds: float) -> int:
-    return -int(-seconds * 1000 // 1)
+    # What a float adds to a whole number of milliseconds is not worth another one.
+    return math.ceil(round(seconds * 1000, 3))

@@ -25,6 +25,8 @@ Floats = NDArray[np.float64]
 _FLAGS = tuple(PickFlag)
 _SOURCES = {int(source): source.name.lower() for source in DepthSource}
 UNIT_TOLERANCE = 1e-3
+# Beyond these a number is not a measurement.
+FARTHEST_M, SMALLEST_M = 100.0, 0.0001
 
 
 class Workspace(BaseModel):
@@ -146,13 +148,13 @@ class Filter:
     def __call__(self, picks: Picks) -> Choice:
         """Return what may be sent of one frame's picks."""
         table = _Table(picks)
-        with np.errstate(invalid="ignore", over="ignore"):
+        with np.errstate(all="ignore"):
             if self._mount is not None:
                 self._mount.apply(table)
             left, withheld = self._sieve(table)
-        order = left[np.lexsort((table.id[left], -table.score[left]))]
-        withheld["limit"] = max(0, len(order) - self._limit)
-        return Choice(table.frame, _targets(table, order[: self._limit]), withheld)
+            order = left[np.lexsort((table.id[left], -table.score[left]))]
+            withheld["limit"] = max(0, len(order) - self._limit)
+            return Choice(table.frame, _targets(table, order[: self._limit]), withheld)
 
     def _sieve(self, table: _Table) -> tuple[NDArray[np.intp], dict[Reason, int]]:
         bad: dict[Reason, Bools] = {
@@ -182,21 +184,31 @@ def _estimated(table: _Table) -> Bools:
 
 
 def _valid(table: _Table) -> Bools:
-    norm = np.linalg.norm(table.quaternion, axis=1)
     # A sigma that is infinite says the measurement failed; NaN only that nobody estimated it.
     sigmas = np.column_stack([table.sigma_position, table.sigma_diameter, table.sigma_tilt])
-    broken = np.isinf(sigmas).any(axis=1) | (sigmas < 0).any(axis=1)
-    size_is_nonsense = (table.diameter <= 0) | np.isinf(table.diameter)
-    turned = ~table.oriented | (np.abs(norm - 1) <= UNIT_TOLERANCE)
-    known = np.isfinite(table.position).all(axis=1) & np.isfinite(table.score)
-    return np.asarray(known & turned & ~broken & ~size_is_nonsense & (table.id >= 0))
+    good = ~(np.isinf(sigmas) | (sigmas < 0)).any(axis=1)
+    good &= (np.abs(table.position) <= FARTHEST_M).all(axis=1)
+    good &= (table.score >= 0) & (table.score <= 1) & (table.id >= 0)
+    sized = (table.diameter >= SMALLEST_M) & (table.diameter <= FARTHEST_M)
+    good &= sized | np.isnan(table.diameter)
+    for direction in (table.quaternion, table.axis):
+        unit = np.abs(np.linalg.norm(direction, axis=1) - 1) <= UNIT_TOLERANCE
+        good &= unit | ~table.oriented
+    return np.asarray(good)
+
+
+def _unit(rows: Floats) -> list[list[float]]:
+    """Return rows of length 1 to six decimals, also where they were so only nearly."""
+    units: list[list[float]] = np.round(
+        rows / np.linalg.norm(rows, axis=1, keepdims=True), 6
+    ).tolist()
+    return units
 
 
 def _targets(table: _Table, rows: NDArray[np.intp]) -> tuple[Target, ...]:
     """Encode rows; a micrometre and a millionth are finer than any camera."""
     position = np.round(table.position, 6).tolist()
-    quaternion = np.round(table.quaternion, 6).tolist()
-    approach = np.round(-table.axis, 6).tolist()
+    quaternion, approach = _unit(table.quaternion), _unit(-table.axis)
     diameter = np.round(table.diameter, 6).tolist()
     score = np.round(table.score, 4).tolist()
     spread = np.round(table.sigma_position, 6).tolist()
