@@ -95,6 +95,17 @@ class Bench:
             if seen == kind and text in line:
                 return line
 
+    def advance_until_disconnected(self, step: float) -> bytes:
+        """Let time pass whenever the server has nothing to do."""
+        while True:
+            try:
+                kind, _, line = self.seen.get(timeout=0.05)
+            except queue.Empty:
+                self.advance(step)
+            else:
+                if kind == "event" and line.startswith(b"disconnected"):
+                    return line
+
 
 @contextmanager
 def bench(

@@ -1,0 +1,289 @@
+"""The sink in a run: what it refuses, what it says when the run goes wrong, and how ages count."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+from mushpipe import Header, Picks, RgbdFrame, RunInfo, Source, Stage, Trace
+from mushpipe.core.document import Document
+from mushpipe.core.errors import DeviceError, UsageError
+from mushpipe.core.graph import compile_document
+from mushpipe.core.plan import Plan
+from mushpipe.core.plugins import load_registry
+from mushpipe.core.report import RunReport
+from mushpipe.core.run import run
+from mushpipe.robot.transcript import read_transcript
+from mushpipe.sinks.robot_json import RobotJsonSink
+from tests.robot.peer import Peer
+from tests.robot.scene import FakeClock, make_picks
+
+ROOT = Path(__file__).parents[2]
+LIVE = RunInfo("test", {}, live=True)
+
+
+def frame_at(stamp_ns: int, arrival_ns: int = 0) -> RgbdFrame:
+    header = Header(stamp_ns, 5, "camera_color_optical_frame", arrival_ns)
+    return RgbdFrame(header, np.zeros((4, 4, 3), np.uint8))
+
+
+@pytest.fixture
+def sink() -> Iterator[RobotJsonSink]:
+    sink = RobotJsonSink(port=0)
+    sink._clock = FakeClock()
+    yield sink
+    sink.close()
+
+
+def port(sink: RobotJsonSink) -> int:
+    assert sink._server
+    return sink._server.ports[0]
+
+
+def consume(sink: RobotJsonSink, stamp_ns: int, arrival_ns: int = 0, spent_s: float = 0) -> None:
+    durations = {"locate": round(spent_s * 1e9)}
+    sink.consume(make_picks(), Trace(frame_at(stamp_ns, arrival_ns), {}, durations))
+
+
+def ages(sink: RobotJsonSink, *frame: Any) -> int | None:
+    """Return the age in ms of a frame that was just consumed, None where it is unknown."""
+    consume(sink, *frame)
+    assert sink._server
+    return sink._server.hub.age_ms(sink._clock.monotonic())
+
+
+def test_a_recording_is_not_served_unless_the_graph_says_so(sink: RobotJsonSink) -> None:
+    with pytest.raises(UsageError, match="replay: true"):
+        sink.open(RunInfo("test", {}))
+
+
+@pytest.mark.parametrize("address", ["0.0.0.0", "::", "192.0.2.1"])
+def test_the_network_is_not_served_without_token_or_tls(address: str) -> None:
+    with pytest.raises(UsageError, match="open to the network"):
+        RobotJsonSink(port=0, bind=address).open(LIVE)
+
+
+def test_settings_that_cannot_be_meant(tmp_path: Path) -> None:
+    short = tmp_path / "token"
+    short.write_text("short\n")
+    cases = [
+        ({"token_file": short}, "16 to 40 characters"),
+        ({"token_file": tmp_path / "none"}, "cannot be read"),
+        ({"tls_cert": short}, "TLS cannot be set up"),
+        ({"tls_client_ca": short}, "needs 'tls_cert'"),
+        ({"bind": "localhost"}, "not an IP address"),
+    ]
+    for settings, text in cases:
+        with pytest.raises(UsageError, match=text):
+            RobotJsonSink.model_validate({"port": 0, **settings}).open(LIVE)
+
+
+def test_a_port_that_is_taken(sink: RobotJsonSink) -> None:
+    sink.open(LIVE)
+    with pytest.raises(UsageError, match="cannot listen on 127.0.0.1"):
+        RobotJsonSink(port=port(sink)).open(LIVE)
+
+
+def test_an_age_counts_from_the_camera_on_the_monotonic_clock(sink: RobotJsonSink) -> None:
+    sink.open(LIVE)
+    clock = sink._clock
+    assert isinstance(clock, FakeClock)
+    stamp = clock.wall_ns()
+    clock.now += 0.1
+    assert ages(sink, stamp, stamp + 30_000_000) == 100
+    # The camera's clock is not the host's: the arrival counts.
+    assert ages(sink, 12345, stamp + 30_000_000) == pytest.approx(70, abs=1)
+    # No stamp makes a frame younger than the time its stages took.
+    assert ages(sink, clock.wall_ns(), clock.wall_ns(), 0.25) == 250
+    # Set back by an hour while the frame was on its way.
+    stamp = clock.wall_ns()
+    clock.now += 0.2
+    clock.offset_s -= 3600
+    assert ages(sink, stamp, stamp) == pytest.approx(200, abs=1)
+    assert ages(sink, clock.wall_ns() + 10**10) is None
+
+
+def test_a_frame_whose_age_nobody_knows_is_stale(
+    sink: RobotJsonSink, caplog: pytest.LogCaptureFixture
+) -> None:
+    sink.open(LIVE)
+    with Peer(port(sink)) as peer:
+        peer.greet()
+        consume(sink, 12345)
+        answer = peer.ask("get_targets", id=1)
+        assert (answer["code"], answer["age_ms"]) == ("stale", None)
+    assert "not of this host" in caplog.text
+
+
+def test_the_latency_of_the_sensor_is_added() -> None:
+    sink = RobotJsonSink(port=0, sensor_latency_ms=40)
+    sink._clock = clock = FakeClock()
+    sink.open(LIVE)
+    stamp = clock.wall_ns()
+    clock.now += 0.1
+    assert ages(sink, stamp, stamp) == 140
+    sink.close()
+
+
+def test_a_recording_ages_from_the_moment_it_is_played() -> None:
+    sink = RobotJsonSink(port=0, replay=True)
+    sink._clock = FakeClock()
+    sink.open(RunInfo("test", {}))
+    assert ages(sink, 12345, 12345, 0.02) == 20
+    with Peer(port(sink)) as peer:
+        peer.greet(accept_replay=True)
+        answer = peer.ask("get_targets", id=1)
+        assert (answer["replay"], answer["stamp"]) == (True, {"sec": 0, "nsec": 12345})
+    sink.close()
+
+
+def test_a_live_source_is_live_even_where_recordings_are_permitted() -> None:
+    sink = RobotJsonSink(port=0, replay=True)
+    sink.open(LIVE)
+    with Peer(port(sink)) as peer:
+        assert not peer.greet()["replay"]
+    sink.close()
+
+
+class Camera(Source):
+    """Delivers frames when told, and then goes on, hangs or breaks."""
+
+    live: ClassVar[bool] = True
+    steps: ClassVar[list[threading.Event]] = []
+    breaks: bool = False
+
+    def frames(self) -> Iterator[RgbdFrame]:
+        clock = RobotJsonSink()._clock
+        for number, step in enumerate(self.steps):
+            step.wait(20)
+            now = clock.wall_ns()
+            frame = frame_at(now, now)
+            yield replace(frame, header=replace(frame.header, sequence=number))
+        if self.breaks:
+            raise DeviceError("the camera was unplugged")
+
+
+class Find(Stage):
+    """Finds the same three mushrooms in every frame, or fails."""
+
+    fails_at: int | None = None
+
+    def process(self, frame: RgbdFrame) -> Picks:
+        """Return three picks."""
+        if frame.header.sequence == self.fails_at:
+            raise ValueError("it fails")
+        return make_picks()
+
+
+def plan_of(**settings: Any) -> Plan:
+    graph = {
+        "mushpipe": 1,
+        "on_error": "fail",
+        "source": {"use": "camera", **settings.pop("source", {})},
+        "stages": {"find": {"use": "find", **settings.pop("find", {})}},
+        "sinks": {"robot": {"use": "robot-json", "port": 0, "max_age_ms": 10_000, **settings}},
+    }
+    registry = load_registry()
+    registry.source("camera", Camera)
+    registry.stage("find", Find)
+    return compile_document(Document("graph.yaml", Path.cwd(), graph), registry)
+
+
+class Running:
+    """A run in a thread of its own."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, plan: Plan, frames: int) -> None:
+        self.steps = [threading.Event() for _ in range(frames)]
+        monkeypatch.setattr(Camera, "steps", self.steps)
+        self.opened = threading.Event()
+        self.port = 0
+        begin = RobotJsonSink.open
+
+        def opened(sink: RobotJsonSink, info: RunInfo) -> None:
+            begin(sink, info)
+            self.port = port(sink)
+            self.opened.set()
+
+        monkeypatch.setattr(RobotJsonSink, "open", opened)
+        self.report: RunReport | None = None
+        self.stop = threading.Event()
+        self.thread = threading.Thread(target=self._run, args=(plan,))
+        self.thread.start()
+        assert self.opened.wait(20)
+
+    def _run(self, plan: Plan) -> None:
+        self.report = run(plan, self.stop)
+
+    def end(self) -> RunReport:
+        for step in self.steps:
+            step.set()
+        self.thread.join(20)
+        assert self.report
+        return self.report
+
+
+@pytest.mark.parametrize(
+    ("settings", "reason", "code"),
+    [
+        ({}, "end", 0),
+        ({"source": {"breaks": True}}, "no_camera", 5),
+        ({"find": {"fails_at": 1}}, "failed", 1),
+    ],
+)
+def test_the_last_word_says_how_it_ended(
+    monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any], reason: str, code: int
+) -> None:
+    running = Running(monkeypatch, plan_of(**settings), 2)
+    with Peer(running.port) as peer:
+        assert not peer.greet("stream")["replay"]
+        running.steps[0].set()
+        assert peer.wait("targets")["count"] == 3
+        running.steps[1].set()
+        assert peer.wait("bye")["reason"] == reason
+        assert peer.rest() == []
+    assert running.end().exit_code == code
+
+
+def test_a_camera_that_falls_silent_is_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    running = Running(monkeypatch, plan_of(stall_ms=100), 2)
+    with Peer(running.port) as peer:
+        peer.greet("stream")
+        running.steps[0].set()
+        peer.wait("targets")
+        while (beat := peer.wait("heartbeat"))["state"] != "no_camera":
+            assert beat["age_ms"] < 2000
+        assert beat["age_ms"] < 2000
+    assert running.end().exit_code == 0
+
+
+def test_the_demo_graph_serves_its_recording(tmp_path: Path) -> None:
+    from mushpipe.core.document import read_document
+
+    overrides = [
+        *("source.speed=0", "source.loop=1", "sinks.robot.port=0"),
+        f"sinks.robot.transcript={tmp_path / 'robot.mcap'}",
+    ]
+    document = read_document(ROOT / "graphs/robot.yaml")
+    report = run(compile_document(document, load_registry(), overrides))
+    assert report.exit_code == 0, report.error
+    assert report.sinks["robot"].consumed == report.processed > 0
+    overrides.append("sinks.robot.replay=false")
+    refused = run(compile_document(document, load_registry(), overrides))
+    assert refused.exit_code == 2
+
+
+def test_a_run_leaves_a_transcript(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    path = tmp_path / "robot.mcap"
+    running = Running(monkeypatch, plan_of(transcript=str(path)), 2)
+    with Peer(running.port) as peer:
+        peer.greet("stream")
+        running.steps[0].set()
+        peer.wait("targets")
+    running.end()
+    assert {line.kind for line in read_transcript(path)} == {"tx", "rx", "event"}
