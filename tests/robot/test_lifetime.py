@@ -49,16 +49,14 @@ def served(port: int = 0) -> Iterator[tuple[subprocess.Popen[str], int]]:
 def test_the_server_is_killed_and_comes_back() -> None:
     with served() as (child, port), Peer(port) as peer:
         first = peer.greet("stream")["session"]
-        late = peer.wait("targets")["seq"]
-        while late < 20:
-            late = peer.wait("targets")["seq"]
+        while peer.wait("targets")["seq"] < 20:
+            pass
         child.kill()
         assert all(m["op"] in ("targets", "heartbeat") for m in peer.rest())
     with served(port) as (_, again), Peer(again) as peer:
         assert again == port
         assert peer.greet("stream")["session"] != first
         message = peer.wait("targets")
-        assert message["seq"] < 20
         assert message["age_ms"] <= 500
 
 
