@@ -39,6 +39,10 @@ def _out(text: str) -> None:
     sys.stdout.flush()
 
 
+def _note(text: str) -> None:
+    sys.stderr.write(text + "\n")
+
+
 def _split(address: str) -> tuple[str, int]:
     host, colon, port = address.rpartition(":")
     if not (colon and host and port.isdecimal()):
@@ -79,10 +83,10 @@ def client(
         try:
             shown = _talk(host, port, mode, hello, (most, max_age_ms, every, ack or []), count, raw)
         except PermissionError as error:
-            sys.stderr.write(f"refused: {error}\n")
+            _note(f"refused: {error}")
             raise typer.Exit(1) from None
         except OSError as error:
-            sys.stderr.write(f"{address}: {error}; trying again\n")
+            _note(f"{address}: {error}; trying again")
             time.sleep(1.0)
 
 
@@ -102,7 +106,7 @@ def _talk(
     asked = {"max": most} | ({} if max_age_ms is None else {"max_age_ms": max_age_ms})
     shown = 0
     with RobotClient(host, port, mode, **hello) as connection:
-        sys.stderr.write(f"connected: {connection.hello['software']}\n")
+        _note(f"connected: {connection.hello['software']}")
         while not count or shown < count:
             if mode is Mode.stream:
                 message = connection.receive()
@@ -171,12 +175,16 @@ def replay(
         _out(f"{sign} {text.decode(errors='backslashreplace')}")
 
     def listening(port: int) -> None:
-        sys.stderr.write(f"listening on 127.0.0.1:{port}\n")
+        _note(f"listening on 127.0.0.1:{port}")
 
     if (connect is None) == (listen is None):
         raise typer.BadParameter("give either --connect or --listen")
     lines = lines_of(file, client)
-    if connect is not None:
-        as_client(lines, *_split(connect), show)
-    else:
-        as_server(lines, listen or 0, show, listening)
+    try:
+        if connect is not None:
+            as_client(lines, *_split(connect), show)
+        else:
+            as_server(lines, listen or 0, show, listening)
+    except OSError as error:
+        _note(f"{connect or 'the client'}: {error}")
+        raise typer.Exit(1) from None
