@@ -75,6 +75,7 @@ class RobotServer:
         except BaseException:
             self._release()
             raise
+        self._ports = tuple(sock.getsockname()[1] for sock in self._sockets)
         self._thread = threading.Thread(target=self._run, name="mushpipe-robot", daemon=True)
 
     def _listen(self, listener: Listener) -> None:
@@ -95,7 +96,7 @@ class RobotServer:
     @property
     def ports(self) -> tuple[int, ...]:
         """Return the ports it listens on, in the order of its listeners."""
-        return tuple(sock.getsockname()[1] for sock in self._sockets)
+        return self._ports
 
     def start(self) -> None:
         """Begin to serve."""

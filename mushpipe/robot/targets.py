@@ -22,7 +22,7 @@ REASONS: tuple[Reason, ...] = ("no_depth", "estimated", "invalid", "workspace", 
 Vector = tuple[float, float, float]
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
-_FLAGS = tuple(PickFlag)
+_FLAGS = tuple((int(flag), flag.name.lower()) for flag in PickFlag if flag.name)
 _SOURCES = {int(source): source.name.lower() for source in DepthSource}
 UNIT_TOLERANCE = 1e-3
 # Beyond these a number is not a measurement.
@@ -232,7 +232,7 @@ def _targets(table: _Table, rows: NDArray[np.intp]) -> tuple[Target, ...]:
                 "tilt": tilt[i],
             },
             "depth": _SOURCES[int(table.source[i])],
-            "flags": [flag.name.lower() for flag in _FLAGS if flag & flags and flag.name],
+            "flags": [name for bit, name in _FLAGS if bit & flags],
         }
         pose = quaternion[i] if oriented else (0.0,) * 4
         size = diameter[i] if diameter[i] == diameter[i] else 0.0

@@ -109,7 +109,11 @@ class Bench:
 
 @contextmanager
 def bench(
-    limits: Limits | None = None, max_clients: int = 8, tls: Any = None, **settings: Any
+    limits: Limits | None = None,
+    max_clients: int = 8,
+    tls: Any = None,
+    watched: bool = True,
+    **settings: Any,
 ) -> Iterator[Bench]:
     """Serve JSON on the first port, lines on the second."""
     clock = FakeClock()
@@ -120,7 +124,9 @@ def bench(
     # A fake clock fills no allowance, so the allowance is the whole test's.
     limits = limits or Limits(lines_per_s=1e9)
     server = RobotServer(
-        hub, Options(listeners, limits, max_clients, tls), lambda *what: seen.put(what)
+        hub,
+        Options(listeners, limits, max_clients, tls),
+        lambda *what: seen.put(what) if watched else None,
     )
     server.start()
     try:

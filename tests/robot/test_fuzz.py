@@ -165,7 +165,7 @@ def flood(count: int) -> None:
     """Send bad lines of all kinds, reading the answers, and see that memory stays flat."""
     kinds = [b"x" * 200, b"{", b'{"op":1}', b'{"op":"ack","id":1}', b"\xff\x00", b'{"op":"ping"}']
     portion = b"\n".join(kinds * 10) + b"\n"
-    with bench() as b, Peer(b.port) as peer:
+    with bench(watched=False) as b, Peer(b.port) as peer:
         peer.greet()
 
         def burst(lines: int) -> None:
@@ -173,8 +173,6 @@ def flood(count: int) -> None:
                 peer.raw(portion)
                 for _ in range(60):
                     assert b'"op":"error"' in peer.reader.readline()
-            while not b.seen.empty():
-                b.seen.get()
 
         burst(1200)
         tracemalloc.start()
@@ -184,7 +182,7 @@ def flood(count: int) -> None:
         after, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
         assert after - before < 100_000
-        assert peak - before < 4_000_000 + 1000 * count  # what the test's own observer keeps
+        assert peak - before < 500_000
         assert peer.ask("ping", id=1)["op"] == "pong"
 
 
