@@ -181,7 +181,8 @@ def flood(count: int) -> None:
         burst(count)
         after, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
-        assert after - before < 100_000
+        # The server may just be reading: two buffers of 64 KiB; a leak would grow with the lines.
+        assert after - before < 200_000
         assert peak - before < 500_000
         assert peer.ask("ping", id=1)["op"] == "pong"
 
