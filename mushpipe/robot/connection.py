@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal
 
+from mushpipe.robot.clock import Clock
 from mushpipe.robot.messages import MAX_LINE, Refusal
 from mushpipe.robot.session import Outgoing, Session
 
@@ -39,7 +40,7 @@ class Limits:
 
 
 class Connection:
-    """A client's socket and its session. All times are monotonic seconds."""
+    """A client's socket and its session."""
 
     def __init__(
         self,
@@ -48,7 +49,7 @@ class Connection:
         number: int,
         limits: Limits,
         observe: Observer,
-        now: float,
+        clock: Clock,
     ) -> None:
         self.sock = sock
         self.session = session
@@ -57,6 +58,7 @@ class Connection:
         self.busy = False
         self._limits = limits
         self._observe = observe
+        self._clock = clock
         self._in = bytearray()
         self._scanned = 0
         self._out = memoryview(b"")
@@ -64,6 +66,7 @@ class Connection:
         self._tls_wants_input = False
         self._eof = False
         self._draining: float | None = None
+        now = clock.monotonic()
         self._opened = self._last_line = self._line_begun = self._progress = now
         self._tokens = limits.lines_per_s
         self._filled = now
@@ -86,8 +89,9 @@ class Connection:
         """Whether the client talks faster than it may."""
         return self._tokens < 1
 
-    def serve(self, now: float) -> None:
+    def serve(self) -> None:
         """Do all that can be done without waiting."""
+        now = self._clock.monotonic()
         self._refill(now)
         if self._draining is not None:
             self._drain(now)
@@ -95,7 +99,7 @@ class Connection:
         if self.wants_input:
             self._read(now)
         if not self.gone:
-            self._pump(now)
+            self._pump()
         if not self.gone and self._draining is None:
             self._check(now)
 
@@ -120,10 +124,11 @@ class Connection:
             self._line_begun = now
         self._in += data
 
-    def _pump(self, now: float) -> None:
+    def _pump(self) -> None:
         """Send and answer, a bounded number of lines; ``busy`` says that more may be waiting."""
         self.busy = False
         for _ in range(BATCH):
+            now = self._clock.monotonic()  # an age must be that of the line, not of the first one
             if self.gone or not self._flush(now):
                 return
             if self.session.closing:
@@ -215,7 +220,7 @@ class Connection:
     def _refuse(self, text: str, now: float) -> None:
         line = self.session.refuse(Refusal("timeout", text, fatal=True), now)
         self._send(line, now)
-        self._pump(now)
+        self._pump()
 
     def _finish(self, now: float) -> None:
         """Say that nothing more comes, and let the client read the last line before the end."""

@@ -106,6 +106,9 @@ class RobotServer:
         """Have the server look at the hub now; never waits."""
         if self._error is not None:
             raise RuntimeError(f"the robot server died: {self._error}") from self._error
+        self._poke()
+
+    def _poke(self) -> None:
         with suppress(OSError):  # full: it is about to wake anyway; closed: it is about to end
             self._outer.send(b"w")
 
@@ -113,7 +116,7 @@ class RobotServer:
         """Tell every client, close every socket, and wait for the thread; half a second at most."""
         self._stopping = self._stopping or reason
         if self._thread.is_alive():
-            self.wake()
+            self._poke()
             self._thread.join(4 * GOODBYE_S)
         elif self._thread.ident is None:
             self._release()
@@ -152,7 +155,6 @@ class RobotServer:
             sock, address = listening.accept()
         except OSError:
             return  # it went away before we looked, or descriptors ran out: the others go on
-        now = self.hub.clock.monotonic()
         self._number += 1
         number = self._number
         try:
@@ -169,14 +171,17 @@ class RobotServer:
             return
         self._observe("event", number, f"connected: {address[0]}:{address[1]}".encode())
         session = listener.session(self.hub, number)
-        client = Connection(sock, session, number, self._options.limits, self._observe, now)
+        client = Connection(
+            sock, session, number, self._options.limits, self._observe, self.hub.clock
+        )
         if len(self._clients) >= self._options.max_clients:
-            self._turn_away(client, now)
+            self._turn_away(client)
             return
         self._clients[number] = client
         self._selector.register(sock, selectors.EVENT_READ, client)
 
-    def _turn_away(self, client: Connection, now: float) -> None:
+    def _turn_away(self, client: Connection) -> None:
+        now = self.hub.clock.monotonic()
         text = f"{self._options.max_clients} clients are served already"
         line = client.session.refuse(Refusal("too_many_clients", text, fatal=True), now)
         with suppress(OSError):
@@ -186,7 +191,7 @@ class RobotServer:
 
     def _serve(self, client: Connection) -> None:
         try:
-            client.serve(self.hub.clock.monotonic())
+            client.serve()
         except Exception:  # a fault met with one client must not cost the others theirs
             logger.exception("robot client %d: internal error; it is disconnected", client.number)
             self._unregister(client)

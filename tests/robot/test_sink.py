@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import ssl
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from mushpipe import Header, Picks, RgbdFrame, RunInfo, Source, Stage, Trace
 from mushpipe.core.document import Document
@@ -19,10 +23,15 @@ from mushpipe.core.plan import Plan
 from mushpipe.core.plugins import load_registry
 from mushpipe.core.report import RunReport
 from mushpipe.core.run import run
+from mushpipe.robot.client import RobotClient
+from mushpipe.robot.clock import STEP_S, Placer
+from mushpipe.robot.hub import Hub, Settings
+from mushpipe.robot.messages import Refusal
 from mushpipe.robot.transcript import read_transcript
+from mushpipe.sinks import robot_json
 from mushpipe.sinks.robot_json import RobotJsonSink
 from tests.robot.peer import Peer
-from tests.robot.scene import FakeClock, make_picks
+from tests.robot.scene import FakeClock, choice, make_picks
 
 ROOT = Path(__file__).parents[2]
 LIVE = RunInfo("test", {}, live=True)
@@ -79,9 +88,64 @@ def test_settings_that_cannot_be_meant(tmp_path: Path) -> None:
         ({"tls_client_ca": short}, "needs 'tls_cert'"),
         ({"bind": "localhost"}, "not an IP address"),
     ]
-    for settings, text in cases:
+    for chosen, text in cases:
         with pytest.raises(UsageError, match=text):
-            RobotJsonSink.model_validate({"port": 0, **settings}).open(LIVE)
+            RobotJsonSink.model_validate({"port": 0, **chosen}).open(LIVE)
+
+
+def test_with_a_token_and_tls_the_network_is_served(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, certificate: Path
+) -> None:
+    # Tests stay on loopback; it plays the network.
+    monkeypatch.setattr(robot_json, "_is_loopback", lambda _: False)
+    (tmp_path / "token").write_text("t" * 16 + "\n")
+    trusting = ssl.create_default_context(cafile=certificate)
+    with_token = {"token_file": tmp_path / "token"}
+    with_tls = {"tls_cert": certificate, "tls_client_ca": certificate}
+    for chosen in (with_token, with_tls, with_token | with_tls):
+        sink = RobotJsonSink.model_validate({"port": 0, **chosen})
+        sink.open(LIVE)
+        hello = {"token": "t" * 16} if "token_file" in chosen else {}
+        context = trusting if "tls_cert" in chosen else None
+        if context:
+            with pytest.raises(OSError):  # noqa: PT011 - it has no certificate to show
+                RobotClient(port=port(sink), tls=context, **hello)
+            context.load_cert_chain(certificate)
+        with RobotClient(port=port(sink), tls=context, **hello) as robot:
+            assert robot.ask("ping")["op"] == "pong"
+        trusting = ssl.create_default_context(cafile=certificate)
+        sink.close()
+
+
+@given(
+    steps=st.lists(
+        st.tuples(st.floats(0, 0.6), st.floats(-2, 2) | st.just(0), st.booleans()), max_size=25
+    ),
+    limit_ms=st.integers(1, 2000),
+)
+@settings(max_examples=100, deadline=None)
+def test_however_the_wall_clock_jumps_nothing_too_old_is_fresh(
+    steps: list[tuple[float, float, bool]], limit_ms: int
+) -> None:
+    """The safety rule itself, against the truth that only the test knows."""
+    sink = RobotJsonSink(port=0, max_age_ms=limit_ms)
+    sink._clock = clock = FakeClock()
+    sink._live = True
+    sink._placer = Placer(clock)
+    hub = Hub(Settings(max_age_s=limit_ms / 1000), clock)
+    taken = None
+    for pause, jump, publish in steps:
+        moment, stamp = clock.now, clock.wall_ns()
+        clock.now += pause
+        clock.offset_s += jump
+        if publish:
+            trace = Trace(frame_at(stamp, stamp), {}, {})
+            hub.publish(choice(), 1, stamp, sink._taken(trace))
+            taken = moment
+        with suppress(Refusal):
+            hub.fresh(clock.now, 1e9)
+            assert taken is not None
+            assert clock.now - taken <= limit_ms / 1000 + 2 * STEP_S
 
 
 def test_a_port_that_is_taken(sink: RobotJsonSink) -> None:
