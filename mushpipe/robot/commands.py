@@ -79,7 +79,7 @@ def client(
     if tls_ca is not None:
         hello["tls"] = ssl.create_default_context(cafile=tls_ca)
     shown = 0
-    while not shown or not count or shown < count:
+    while not count or shown < count:
         try:
             shown = _talk(host, port, mode, hello, (most, max_age_ms, every, ack or []), count, raw)
         except PermissionError as error:

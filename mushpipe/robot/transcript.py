@@ -6,9 +6,10 @@ import base64
 import logging
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from typing import Any
 
 import orjson
@@ -22,6 +23,8 @@ from mushpipe.robot.connection import Kind
 
 logger = logging.getLogger("mushpipe")
 PREFIX = "/robot/"
+# A process that is killed loses no more than this of its last words.
+FLUSH_S = 2.0
 MOST_BYTES = 64 * 1024 * 1024
 SCHEMA = wire.json_schema(
     "mushpipe.RobotLine",
@@ -52,7 +55,7 @@ class Transcript:
     """
 
     def __init__(self, path: Path, clock: Clock, secret: str = "") -> None:
-        self.lost = 0
+        self.lost = self._told = 0
         self._clock = clock
         self._secret = secret.encode()
         self._writer = RecordingWriter(path, {})
@@ -76,21 +79,35 @@ class Transcript:
         self._queue.put((Line(kind, client, text, moment), self._clock.wall_ns()))
 
     def _run(self) -> None:
-        told = 0
-        while (item := self._queue.get()) is not None:
-            line, wall_ns = item
-            try:
-                if self.lost > told:
-                    gap = f"{self.lost - told} lines are missing here".encode()
-                    told = self.lost
-                    self._write(Line("event", 0, gap, line.time_ns), wall_ns)
-                self._write(line, wall_ns)
-            except OSError as error:
-                logger.error("the transcript ends here: %s", error)
-                self._drop_the_rest()
-                return
-            with self._lock:
-                self._waiting -= len(line.text)
+        try:
+            while self._pass_on():
+                pass
+        except OSError as error:
+            logger.error("the robot's transcript ends here: %s", error)
+            self._drop_the_rest()
+
+    def _pass_on(self) -> bool:
+        """Write what comes for a while, then make it safe; False at the end."""
+        written, until = 0, self._clock.monotonic() + FLUSH_S
+        with suppress(Empty):
+            while (left := until - self._clock.monotonic()) > 0:
+                item = self._queue.get(timeout=left)
+                if item is None:
+                    return False
+                self._note_gap(*item)
+                self._write(*item)
+                written += 1
+                with self._lock:
+                    self._waiting -= len(item[0].text)
+        if written:
+            self._writer.flush()
+        return True
+
+    def _note_gap(self, line: Line, wall_ns: int) -> None:
+        missing, self._told = self.lost - self._told, self.lost
+        if missing:
+            text = f"{missing} lines are missing here".encode()
+            self._write(Line("event", 0, text, line.time_ns), wall_ns)
 
     def _drop_the_rest(self) -> None:
         with self._lock:

@@ -12,6 +12,7 @@ import pytest
 from mushpipe.core.errors import InputError
 from mushpipe.robot import transcript as module
 from mushpipe.robot.client import RobotClient
+from mushpipe.robot.clock import Clock
 from mushpipe.robot.replay import as_client, as_server, lines_of
 from mushpipe.robot.transcript import Transcript, read_transcript
 from tests.robot.peer import CLIENT, SERVER, Peer
@@ -108,6 +109,37 @@ def test_a_disk_that_cannot_follow_leaves_a_gap_that_is_told(
     assert texts[-1] == b"again"
     assert b"3 lines are missing here" in texts
     assert "3 lines are missing" in caplog.text
+
+
+def test_a_process_that_is_killed_leaves_what_was_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, safe = tmp_path / "robot.mcap", threading.Event()
+    monkeypatch.setattr(module, "FLUSH_S", 0.01)
+    log = Transcript(path, Clock())
+    flush = log._writer.flush
+    monkeypatch.setattr(log._writer, "flush", lambda: (flush(), safe.set()))
+    log.observe("rx", 1, b"hello")
+    assert safe.wait(PATIENCE_S)
+    (tmp_path / "copy.mcap").write_bytes(path.read_bytes())  # as it stands, without its end
+    assert [line.text for line in read_transcript(tmp_path / "copy.mcap")] == [b"hello"]
+    log.close()
+
+
+def test_a_full_disk_ends_the_transcript_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    log = Transcript(tmp_path / "robot.mcap", FakeClock())
+    monkeypatch.setattr(log, "_write", full)
+    log.observe("rx", 1, b"lost")
+    log._thread.join(PATIENCE_S)
+    log.observe("rx", 1, b"lost as well")
+    log.close()
+    assert log.lost == 1
+    assert "No space left on device" in caplog.text
 
 
 def test_a_recording_without_a_transcript(tmp_path: Path) -> None:
