@@ -231,19 +231,18 @@ class Connection:
 
     def _drain(self, now: float) -> None:
         # Closing a socket with unread input resets it, and the client would lose our last line.
+        over = now - (self._draining or now) > self._limits.drain_s
         try:
             for _ in range(BATCH):
                 if not self.sock.recv(MAX_LINE):
-                    self.abort("closed", reset=False)
-                    return
+                    over = True
+                    break
         except _WOULD_BLOCK:
-            if now - (self._draining or now) > self._limits.drain_s:
-                self.abort("closed", reset=False)
+            pass
         except OSError:
+            over = True
+        if over:
             self.abort("closed", reset=False)
-        else:
-            if now - (self._draining or now) > self._limits.drain_s:
-                self.abort("closed", reset=False)
 
     def abort(self, reason: str, reset: bool = True) -> None:
         """Close at once; with ``reset`` the kernel discards what the client did not take yet."""
