@@ -52,6 +52,7 @@ SEGMENTERS: dict[str, Otsu | KMeans | ChanVese | Height] = {
     "chan-vese": ChanVese(),
     "morphological": ChanVese(solver="morphological"),
     "auto": ChanVese(channel="auto"),
+    "gray+height": ChanVese(channel="gray+height"),
     FLAT + "chan-vese": ChanVese(),
     FLAT + "auto": ChanVese(channel="auto"),
     "height": Height(),

@@ -19,3 +19,4 @@ def mushpipe_register(registry: Registry) -> None:
     registry.stage("picks", "mushpipe.stages.picks:MakePicks")
     registry.sink("mcap", "mushpipe.sinks.mcap:McapSink")
     registry.sink("rerun", "mushpipe.sinks.rerun:RerunSink")
+    registry.sink("robot-json", "mushpipe.sinks.robot_json:RobotJsonSink")

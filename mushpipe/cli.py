@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mushpipe.evaluate.cli import register as register_eval
+from mushpipe.robot.commands import app as robot_app
 
 if TYPE_CHECKING:
     from mushpipe.core.plan import Plan
@@ -28,6 +29,7 @@ app = typer.Typer(
 )
 plugins_app = typer.Typer(help="What is installed.", no_args_is_help=True)
 app.add_typer(plugins_app, name="plugins")
+app.add_typer(robot_app, name="robot")
 
 GraphArgument = Annotated[Path, typer.Argument(help="graph file, or a failure capsule")]
 SetOption = Annotated[

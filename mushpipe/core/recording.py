@@ -287,6 +287,10 @@ class RecordingWriter:
             )
         return self._channels[key]
 
+    def flush(self) -> None:
+        """End the open chunk and write all so far, so that a killed process loses none of it."""
+        self._writer.flush()  # type: ignore[no-untyped-call]
+
     def close(self) -> None:
         """Write index and footer; the file is complete only after this."""
         self._writer.finish()  # type: ignore[no-untyped-call]

@@ -72,8 +72,10 @@ class _Runner:
         source = self.plan.source.plugin
         if not isinstance(source, Source):
             raise TypeError("the plan's source is not a Source")
+        reader = SourceThread(self.plan.source, source, threading.Event())
         with _named(self.plan.source):
-            info = RunInfo(source.name(), build_manifest(self.plan))
+            manifest = build_manifest(self.plan)
+            info = RunInfo(source.name(), manifest, source.live, lambda: reader.box.accepted)
             self._spare_the_recording(source, info)
         with ExitStack() as stack:
             stack.enter_context(_opened(self.plan.source, _opener(self.plan.source)))
@@ -82,7 +84,6 @@ class _Runner:
             for node in self.plan.sinks:
                 stack.enter_context(_opened(node, _opener(node, info)))
             threads = [self._sink_thread(node) for node in self.plan.sinks]
-            reader = SourceThread(self.plan.source, source, threading.Event())
             try:
                 self._loop(reader, threads)
             except StageError as error:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from inspect import Parameter, signature
 from pathlib import Path
@@ -38,10 +38,14 @@ class RunInfo:
     Attributes:
         recording: Name of what is played, for file names.
         manifest: Resolved graph, versions, recording and seed; plain data.
+        live: Whether the frames come from a camera now; False for anything played again.
+        frames_read: Returns how many frames the source has delivered; any thread may ask.
     """
 
     recording: str
     manifest: Mapping[str, Any]
+    live: bool = False
+    frames_read: Callable[[], int] = lambda: 0
 
     def path(self, template: Path) -> Path:
         """Fill ``{recording}`` into a path and make its folder."""

@@ -128,3 +128,20 @@ def test_rise_is_the_height_above_a_tilted_bed() -> None:
     assert rise(frame, ~caps) == pytest.approx(-0.02, rel=0.15)
     assert np.isnan(rise(frame, np.zeros_like(caps)))
     assert np.isnan(rise(frame, np.ones_like(caps)))
+
+
+def test_height_beside_gray_finds_caps_of_the_colour_of_soil() -> None:
+    frame = scene((None, SOIL))
+    depth = np.full((240, 320), 0.5, np.float32)
+    depth[LEFT | RIGHT] = 0.47
+    raised = RgbdFrame(HEADER, frame.color, depth, 1.0)
+    assert not ChanVese().process(raised).foreground.any()
+    found = ChanVese(channel="gray+height").process(raised).foreground
+    assert iou(found, LEFT | RIGHT) > 0.95
+
+
+def test_height_beside_gray_is_gray_where_there_is_no_depth() -> None:
+    frame = scene((None, SOIL), (LEFT, WHITE))
+    expected = ChanVese().process(frame).foreground
+    assert (ChanVese(channel="gray+height").process(frame).foreground == expected).all()
+    assert expected.any()

@@ -1,0 +1,109 @@
+MODULE MushroomPicker
+    ! RAPID client of the lines for ABB (docs/robot.md), for a graph with
+    !   robot: {use: robot-json, abb_port: 5006, mount: {...}, workspace: {...}}
+    ! Not run on a controller yet: check it in RobotStudio before you trust it.
+    ! The camera's mount must be in the frame of this work object.
+    PERS wobjdata wobj_bed := [FALSE, TRUE, "", [[0,0,0],[1,0,0,0]], [[0,0,0],[1,0,0,0]]];
+    PERS tooldata tool_cup := [TRUE, [[0,0,120],[1,0,0,0]], [0.5,[0,0,60],[1,0,0,0],0,0,0]];
+    CONST num MAX_AGE_MS := 200;
+    VAR socketdev vision;
+
+    PROC main()
+        Connect;
+        WHILE TRUE DO
+            PickOne;
+        ENDWHILE
+    ERROR
+        ! Whatever broke the connection: nothing received before counts any more.
+        StopMove;
+        SocketClose vision;
+        WaitTime 1;
+        StartMove;
+        Connect;
+        TRYNEXT;
+    ENDPROC
+
+    PROC Connect()
+        VAR string answer;
+        SocketCreate vision;
+        SocketConnect vision, "127.0.0.1", 5006 \Time:=3;
+        answer := Ask("HELLO,1,NAME=irb");
+        IF answer <> "HELLO,1,LIVE" THEN
+            TPWrite "vision: " + answer;
+            Stop;
+        ENDIF
+    ENDPROC
+
+    ! One line out, one line in. The server never speaks unasked.
+    FUNC string Ask(string text)
+        VAR string answer;
+        SocketSend vision \Str:=text + "\0A";
+        SocketReceive vision \Str:=answer \Time:=3;
+        RETURN StrPart(answer, 1, StrLen(answer) - 1);
+    ENDFUNC
+
+    ! Take the next comma-separated field off the line.
+    FUNC string Field(INOUT string line)
+        VAR num comma;
+        VAR string value;
+        comma := StrFind(line, 1, ",");
+        value := StrPart(line, 1, comma - 1);
+        IF comma < StrLen(line) THEN
+            line := StrPart(line, comma + 1, StrLen(line) - comma);
+        ELSE
+            line := "";
+        ENDIF
+        RETURN value;
+    ENDFUNC
+
+    FUNC num Number(INOUT string line)
+        VAR num value;
+        IF NOT StrToVal(Field(line), value) THEN
+            RAISE ERR_ARGVALERR;
+        ENDIF
+        RETURN value;
+    ENDFUNC
+
+    PROC PickOne()
+        VAR string line;
+        VAR string id;
+        VAR pos place;
+        VAR orient turn;
+        VAR num diameter;
+        VAR num flags;
+        VAR robtarget cap;
+        VAR clock asked;
+        line := Ask("NEXT," + ValToStr(MAX_AGE_MS));
+        IF Field(line) <> "T" THEN
+            WaitTime 0.2;   ! NONE, or E,STALE,...: there is nothing to do now
+            RETURN;
+        ENDIF
+        id := Field(line);
+        place.x := Number(line);
+        place.y := Number(line);
+        place.z := Number(line);
+        turn.q1 := Number(line);
+        turn.q2 := Number(line);
+        turn.q3 := Number(line);
+        turn.q4 := Number(line);
+        diameter := Number(line);
+        flags := Number(line);
+        IF BitAnd(flags, 4) <> 0 THEN
+            line := Ask("ACK," + id + ",REJECTED");   ! the orientation is unknown
+            RETURN;
+        ENDIF
+        line := Ask("ACK," + id + ",ACCEPTED");
+        IF line <> "A," + id + ",REMOVED" THEN
+            RETURN;
+        ENDIF
+        ! +z of the cap points out of it, the tool's +z into it: half a turn about x.
+        cap := CRobT(\Tool:=tool_cup \WObj:=wobj_bed);
+        cap.trans := place;
+        cap.rot := NOrient(turn) * [0,1,0,0];
+        MoveL RelTool(cap, 0, 0, -80), v200, fine, tool_cup \WObj:=wobj_bed;
+        MoveL cap, v50, fine, tool_cup \WObj:=wobj_bed;
+        ! ... grip and twist ...
+        MoveL RelTool(cap, 0, 0, -80), v50, fine, tool_cup \WObj:=wobj_bed;
+        line := Ask("ACK," + id + ",DONE");
+    ENDPROC
+ENDMODULE

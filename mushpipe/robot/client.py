@@ -1,0 +1,90 @@
+"""The reference client: docs/robot.md in a class that needs nothing but the standard library."""
+
+from __future__ import annotations
+
+import json
+import socket
+import ssl
+from types import TracebackType
+from typing import Any
+
+Message = dict[str, Any]
+
+
+class RobotClient:
+    """A connection to the robot socket; use it in a ``with`` block.
+
+    After ``timeout_s`` without a line the server counts as dead and every method raises OSError.
+
+    Raises:
+        OSError: The server cannot be reached, is silent, or has gone.
+        PermissionError: It refused us; the text is the server's.
+    """
+
+    def __init__(
+        self,
+        host: str = "127.0.0.1",
+        port: int = 5005,
+        mode: str = "request",
+        timeout_s: float = 3.0,
+        tls: ssl.SSLContext | None = None,
+        **hello: Any,
+    ) -> None:
+        self._socket = socket.create_connection((host, port), timeout_s)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        if tls is not None:
+            self._socket = tls.wrap_socket(self._socket, server_hostname=host)
+        self._lines = self._socket.makefile("rb")
+        self._id = 0
+        self.hello = self.receive()
+        self.send("hello", version="1.0", mode=mode, **hello)
+        first = self.hello if self.hello["op"] == "error" else self.receive()
+        if first["op"] == "error":
+            self.close()
+            raise PermissionError(f"{first['code']}: {first['message']}")
+
+    def send(self, op: str, **fields: Any) -> None:
+        """Send a line."""
+        self._socket.sendall(json.dumps({"op": op, **fields}).encode() + b"\n")
+
+    def receive(self) -> Message:
+        """Return the next line, whatever it is."""
+        line = self._lines.readline()
+        if not line.endswith(b"\n"):
+            raise ConnectionError("the server has gone")
+        message: Message = json.loads(line)
+        return message
+
+    def ask(self, op: str, **fields: Any) -> Message:
+        """Send a request and return its answer, passing over heartbeats and streamed targets."""
+        self._id += 1
+        self.send(op, id=self._id, **fields)
+        while True:
+            message = self.receive()
+            if message.get("id") == self._id or message["op"] == "bye" or message.get("fatal"):
+                return message
+
+    def targets(self, **fields: Any) -> list[Message]:
+        """Return what may be picked now, best first; nothing where the server has nothing fresh."""
+        found: list[Message] = self.ask("get_targets", **fields).get("targets", [])
+        return found
+
+    def ack(self, target: str, result: str, **fields: Any) -> bool:
+        """Tell what the robot does with a target; only True allows it to go on."""
+        return bool(self.ask("ack", target=target, result=result, **fields)["op"] == "acked")
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._lines.close()
+        self._socket.close()
+
+    def __enter__(self) -> RobotClient:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()

@@ -1,0 +1,76 @@
+"""Time that a robot can rely on, whatever happens to the wall clock."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from dataclasses import dataclass
+
+MEMORY_S = 10.0
+TOLERANCE_S = 0.02
+STEP_S = 0.002
+# Time spent in suspend must age a target, too; CLOCK_MONOTONIC stands still meanwhile.
+_MONOTONIC = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
+
+
+class Clock:
+    """The two clocks of the host; a test puts its own in their place."""
+
+    def monotonic(self) -> float:
+        """Return seconds that never jump, from an arbitrary start."""
+        return time.clock_gettime(_MONOTONIC)
+
+    def wall_ns(self) -> int:
+        """Return ns since the epoch; it may jump at any time, both ways."""
+        return time.time_ns()
+
+
+@dataclass
+class _Span:
+    """A stretch of monotonic time during which wall minus monotonic was constant."""
+
+    begin: float
+    end: float
+    offset: float
+
+
+class Placer:
+    """Puts the host's wall-clock stamps on the monotonic clock, across jumps of the former.
+
+    It remembers for `MEMORY_S` which offset the wall clock had when. A stamp that the wall clock
+    has shown twice, because it was set back in between, counts as the older of the two.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        now, offset = self._read()
+        self._spans = deque([_Span(now - MEMORY_S, now, offset)])
+
+    def _read(self) -> tuple[float, float]:
+        now = self._clock.monotonic()
+        return now, self._clock.wall_ns() / 1e9 - now
+
+    def sample(self) -> float:
+        """Look at both clocks; return the monotonic time. To be called a few times a second."""
+        now, offset = self._read()
+        last = self._spans[-1]
+        if abs(offset - last.offset) > STEP_S:
+            # The jump came at an unknown moment since the last look: both offsets may hold there.
+            self._spans.append(_Span(last.end, now, offset))
+        self._spans[-1].end = last.end = now
+        while self._spans[0].end < now - MEMORY_S:
+            self._spans.popleft()
+        self._spans[0].begin = max(self._spans[0].begin, now - MEMORY_S)
+        return now
+
+    def place(self, stamp_ns: int) -> float | None:
+        """Return the monotonic time of a stamp; None for the future and the far past."""
+        now = self.sample()
+        found = [
+            time_s
+            for span in self._spans
+            if span.begin - TOLERANCE_S
+            <= (time_s := stamp_ns / 1e9 - span.offset)
+            <= span.end + TOLERANCE_S
+        ]
+        return min(now, *found) if found else None

@@ -1,0 +1,190 @@
+"""The verbs of `mushpipe robot`: try out a connection, replay a complaint."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from mushpipe.robot.client import RobotClient
+
+app = typer.Typer(help="Talk to the robot socket, as a robot would.", no_args_is_help=True)
+AddressArgument = Annotated[str, typer.Argument(help="host:port of a sink robot-json")]
+
+
+class Mode(StrEnum):
+    """How targets come."""
+
+    request = "request"
+    stream = "stream"
+
+
+class Outcome(StrEnum):
+    """What an acknowledgement may say."""
+
+    accepted = "accepted"
+    rejected = "rejected"
+    done = "done"
+    failed = "failed"
+
+
+def _out(text: str) -> None:
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def _note(text: str) -> None:
+    sys.stderr.write(text + "\n")
+
+
+def _split(address: str) -> tuple[str, int]:
+    host, colon, port = address.rpartition(":")
+    if not (colon and host and port.isdecimal()):
+        raise typer.BadParameter(f"'{address}' is not host:port")
+    return host, int(port)
+
+
+@app.command()
+def client(
+    address: AddressArgument = "127.0.0.1:5005",
+    mode: Annotated[Mode, typer.Option(help="ask, or be sent every result")] = Mode.request,
+    count: Annotated[int, typer.Option(help="messages to show; 0 is for ever", min=0)] = 0,
+    most: Annotated[int, typer.Option("--max", help="targets to ask for", min=1, max=1000)] = 10,
+    max_age_ms: Annotated[int | None, typer.Option(help="refuse what is older", min=1)] = None,
+    every: Annotated[float, typer.Option(help="seconds between requests", min=0, max=9)] = 1.0,
+    ack: Annotated[
+        list[Outcome] | None, typer.Option(help="say this of the best target; may be repeated")
+    ] = None,
+    accept_replay: Annotated[
+        bool, typer.Option("--accept-replay", help="take targets of a recording")
+    ] = False,
+    name: Annotated[str, typer.Option(help="what to call ourselves")] = "",
+    token_file: Annotated[Path | None, typer.Option(help="file with the server's token")] = None,
+    tls_ca: Annotated[Path | None, typer.Option(help="speak TLS; trust this PEM")] = None,
+    raw: Annotated[bool, typer.Option("--raw", help="print the lines as they come")] = False,
+) -> None:
+    """Print targets and acknowledge them, reconnecting when the server goes away."""
+    import ssl
+
+    host, port = _split(address)
+    hello: dict[str, Any] = {"accept_replay": accept_replay, "name": name}
+    if token_file is not None:
+        hello["token"] = token_file.read_text().strip()
+    if tls_ca is not None:
+        hello["tls"] = ssl.create_default_context(cafile=tls_ca)
+    shown = 0
+    while not count or shown < count:
+        try:
+            shown = _talk(host, port, mode, hello, (most, max_age_ms, every, ack or []), count, raw)
+        except PermissionError as error:
+            _note(f"refused: {error}")
+            raise typer.Exit(1) from None
+        except OSError as error:
+            _note(f"{address}: {error}; trying again")
+            time.sleep(1.0)
+
+
+def _talk(
+    host: str,
+    port: int,
+    mode: Mode,
+    hello: dict[str, Any],
+    wishes: tuple[int, int | None, float, list[Outcome]],
+    count: int,
+    raw: bool,
+) -> int:
+    """Hold one conversation; return how many messages were shown."""
+    from mushpipe.robot.client import RobotClient
+
+    most, max_age_ms, every, ack = wishes
+    asked = {"max": most} | ({} if max_age_ms is None else {"max_age_ms": max_age_ms})
+    shown = 0
+    with RobotClient(host, port, mode, **hello) as connection:
+        _note(f"connected: {connection.hello['software']}")
+        while not count or shown < count:
+            if mode is Mode.stream:
+                message = connection.receive()
+                connection.send("heartbeat")
+            else:
+                message = connection.ask("get_targets", **asked)
+            _show(message, raw)
+            shown += message["op"] != "heartbeat"
+            if message["op"] == "bye":
+                raise ConnectionError(f"the server says bye: {message['reason']}")
+            _acknowledge(connection, message, ack, raw)
+            if mode is Mode.request and (not count or shown < count):
+                time.sleep(every)
+    return shown
+
+
+def _acknowledge(
+    connection: RobotClient, message: dict[str, Any], ack: list[Outcome], raw: bool
+) -> None:
+    for outcome in ack if message.get("targets") else []:
+        target = message["targets"][0]["id"]
+        _show(connection.ask("ack", target=target, result=outcome.value), raw)
+
+
+def _show(message: dict[str, Any], raw: bool) -> None:
+    if raw:
+        _out(json.dumps(message))
+        return
+    mark = " REPLAY" if message.get("replay") else ""
+    if message["op"] != "targets":
+        keys = ("state", "code", "message", "target", "result", "effect", "reason", "age_ms")
+        known = " ".join(f"{key}={message[key]}" for key in keys if message.get(key) is not None)
+        _out(f"{message['op']}{mark} {known}")
+        return
+    held = ", ".join(f"{n} {reason}" for reason, n in message["withheld"].items() if n)
+    _out(
+        f"targets{mark} seq={message['seq']} age={message['age_ms']} ms frame={message['frame']} "
+        f"count={message['count']}{' of more' if message['more'] else ''}"
+        f"{f', withheld: {held}' if held else ''}"
+    )
+    for target in message["targets"]:
+        place = " ".join(f"{1000 * value:8.1f}" for value in target["position"])
+        size = "?" if target["diameter"] is None else f"{1000 * target['diameter']:.1f}"
+        flags = ",".join(target["flags"])
+        _out(f"  {target['id']:>6} {place} mm  d {size} mm  score {target['score']:.2f}  {flags}")
+
+
+@app.command()
+def replay(
+    file: Annotated[Path, typer.Argument(help="transcript written by a sink robot-json")],
+    connect: Annotated[
+        str | None, typer.Option(help="host:port of a server: play the client to it")
+    ] = None,
+    listen: Annotated[
+        int | None, typer.Option(help="port on loopback: play the server to one client")
+    ] = None,
+    client: Annotated[int | None, typer.Option(help="whose lines; default the first's")] = None,
+) -> None:
+    """Play a recorded transcript against a server or a client, printing every line.
+
+    To a client every message says that it is a replay.
+    """
+    from mushpipe.robot.replay import as_client, as_server, lines_of
+
+    def show(sign: str, text: bytes) -> None:
+        _out(f"{sign} {text.decode(errors='backslashreplace')}")
+
+    def listening(port: int) -> None:
+        _note(f"listening on 127.0.0.1:{port}")
+
+    if (connect is None) == (listen is None):
+        raise typer.BadParameter("give either --connect or --listen")
+    lines = lines_of(file, client)
+    try:
+        if connect is not None:
+            as_client(lines, *_split(connect), show)
+        else:
+            as_server(lines, listen or 0, show, listening)
+    except OSError as error:
+        _note(f"{connect or 'the client'}: {error}")
+        raise typer.Exit(1) from None

@@ -1,0 +1,200 @@
+"""What all clients share: the newest result, the pipeline's state, and who works on what."""
+
+from __future__ import annotations
+
+import math
+import uuid
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import orjson
+
+from mushpipe.robot.clock import Clock
+from mushpipe.robot.ledger import Ledger, Outcome
+from mushpipe.robot.messages import HEARTBEAT_S, PROTOCOL, VERSION, Refusal, State
+from mushpipe.robot.targets import Choice, Reason, Target
+
+Ending = Literal["end", "failed", "no_camera", "client"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What every session is held to; times in seconds."""
+
+    max_age_s: float = 0.5
+    stall_s: float = 1.0
+    client_timeout_s: float = 10.0
+    claim_s: float = 60.0
+    replay: bool = False
+    token: str = ""
+    software: str = "mushpipe"
+
+
+@dataclass(frozen=True)
+class Result:
+    """The targets of one frame.
+
+    Attributes:
+        seq: Number of the result in this session, from 1.
+        frame_number: The frame's sequence number at its source.
+        stamp_ns: Sensor time, ns since the epoch.
+        taken: Monotonic time from which its age counts, s; minus infinity where nobody knows.
+        published: Monotonic time at which the pipeline handed it over, s.
+        choice: The targets.
+    """
+
+    seq: int
+    frame_number: int
+    stamp_ns: int
+    taken: float
+    published: float
+    choice: Choice
+
+
+class Hub:
+    """The server's memory; it holds one result, never more.
+
+    `publish` may be called by another thread; everything else belongs to the server's.
+    """
+
+    def __init__(
+        self, settings: Settings, clock: Clock, frames_read: Callable[[], int] = lambda: 0
+    ) -> None:
+        self.settings = settings
+        self.clock = clock
+        self.session = str(uuid.uuid4())
+        self.ledger = Ledger(settings.claim_s)
+        self.newest: Result | None = None
+        self.ending: Ending | None = None
+        self._frames_read = frames_read
+        self._begin = clock.monotonic()
+        # A source that has delivered nothing yet has not been seen to work.
+        self._read = (0, self._begin - settings.stall_s)
+        self._seen = 0
+        self._cache: tuple[tuple[int, int, int], bytes, dict[Reason, int], bool] | None = None
+
+    def publish(self, choice: Choice, frame_number: int, stamp_ns: int, taken: float) -> Result:
+        """Put a new result in the place of the last one."""
+        seq = self.newest.seq + 1 if self.newest else 1
+        now = self.clock.monotonic()
+        self.newest = Result(seq, frame_number, stamp_ns, min(taken, now), now, choice)
+        return self.newest
+
+    def tick(self, now: float) -> None:
+        """Notice what time and the pipeline have done."""
+        count = self._frames_read()
+        if count != self._read[0]:
+            self._read = (count, now)
+        result = self.newest
+        if result is not None and result.seq != self._seen:
+            self._seen = result.seq
+            self.ledger.see((target.id for target in result.choice.targets), now)
+        self.ledger.settle(now)
+
+    def state(self, now: float) -> State:
+        """Say how the pipeline is."""
+        if self.ending is not None:
+            return "no_camera" if self.ending == "no_camera" else "stalled"
+        if self.newest is not None and now - self.newest.published <= self.settings.stall_s:
+            return "running"
+        delivering = now - self._read[1] < self.settings.stall_s
+        return "stalled" if delivering or self.settings.replay else "no_camera"
+
+    def fresh(self, now: float, max_age_s: float) -> Result:
+        """Return the newest result.
+
+        Raises:
+            Refusal: `stale`: there is none, or it is older than allowed.
+        """
+        result = self.newest
+        limit = min(max_age_s, self.settings.max_age_s)
+        if result is None or not now - result.taken <= limit or self.ending:
+            text = "there is no result yet" if result is None else "the newest result is too old"
+            raise Refusal("stale", text, state=self.state(now), age_ms=self.age_ms(now))
+        return result
+
+    def age_ms(self, now: float) -> int | None:
+        """Return the age of the newest result, rounded up; None where nobody knows it."""
+        age = max(0.0, now - self.newest.taken) if self.newest else float("inf")
+        return None if age == float("inf") else _ceil_ms(age)
+
+    def envelope(self, now: float) -> dict[str, Any]:
+        """Return what stands in every message."""
+        return {"t_ms": int((now - self._begin) * 1000), "replay": self.settings.replay}
+
+    def greeting(self, now: float) -> dict[str, Any]:
+        """Return the content of the server's hello."""
+        settings = self.settings
+        return {
+            "protocol": PROTOCOL,
+            "version": VERSION,
+            "software": settings.software,
+            "session": self.session,
+            "units": {"length": "m", "angle": "rad"},
+            "quaternion": "xyzw",
+            "frame": self.newest.choice.frame if self.newest else None,
+            "max_age_ms": round(settings.max_age_s * 1000),
+            "heartbeat_ms": round(HEARTBEAT_S * 1000),
+            "client_timeout_ms": round(settings.client_timeout_s * 1000),
+            "auth": "token" if settings.token else "none",
+            **self.envelope(now),
+        }
+
+    def targets_line(
+        self, result: Result, now: float, most: int, limit_s: float, identity: Any
+    ) -> bytes:
+        """Encode a `targets` message with the age it has now."""
+        body, withheld, more = self._body(result, most)
+        age = max(0.0, now - result.taken)  # it may have come since the server looked at the clock
+        limit = min(limit_s, self.settings.max_age_s)
+        head = {
+            "op": "targets",
+            "id": identity,
+            "seq": result.seq,
+            "status": "ok",
+            "frame_number": result.frame_number,
+            "stamp": {"sec": result.stamp_ns // 10**9, "nsec": result.stamp_ns % 10**9},
+            "age_ms": _ceil_ms(age),
+            "valid_ms": max(0, math.floor(round((limit - age) * 1000, 3))),
+            "frame": result.choice.frame,
+            **self.envelope(now),
+            "withheld": withheld,
+            "more": more,
+        }
+        return orjson.dumps(head)[:-1] + body
+
+    def offered(self, result: Result) -> list[Target]:
+        """Return the targets nobody has claimed, best first."""
+        hidden = self.ledger.hidden()
+        return [target for target in result.choice.targets if target.id not in hidden]
+
+    def _body(self, result: Result, most: int) -> tuple[bytes, dict[Reason, int], bool]:
+        """Encode what is the same for every client, once."""
+        key = (result.seq, self.ledger.version, most)
+        if self._cache is None or self._cache[0] != key:
+            offered = self.offered(result)
+            sent = offered[:most]
+            claimed = len(result.choice.targets) - len(offered)
+            withheld: dict[Reason, int] = {**result.choice.withheld, "claimed": claimed}
+            listed = b",".join(target.json for target in sent)
+            body = b',"count":%d,"targets":[%s]}\n' % (len(sent), listed)
+            self._cache = (key, body, withheld, len(sent) < len(offered))
+        return self._cache[1:]
+
+    def acknowledge(
+        self, owner: str, target: int, outcome: Outcome, hold_s: float, now: float
+    ) -> Literal["removed", "restored"]:
+        """Take a robot's word on a target.
+
+        Raises:
+            Refusal: See `Ledger.apply`.
+        """
+        listed = self.newest.choice.targets if self.newest else ()
+        visible = any(target == known.id for known in listed)
+        return self.ledger.apply(owner, target, outcome, hold_s, visible, now)
+
+
+def _ceil_ms(seconds: float) -> int:
+    # What a float adds to a whole number of milliseconds is not worth another one.
+    return math.ceil(round(seconds * 1000, 3))

@@ -1,0 +1,242 @@
+"""The safety filter: which picks become targets, and the form in which they leave.
+
+A pick is withheld, and counted under one reason, unless everything a robot needs is known and
+finite. What is unknown and not needed (orientation, diameter, sigmas) leaves as null.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import orjson
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from mushpipe.core.tables import DepthSource, PickFlag, Picks
+
+Reason = Literal["no_depth", "estimated", "invalid", "workspace", "claimed", "limit"]
+REASONS: tuple[Reason, ...] = ("no_depth", "estimated", "invalid", "workspace", "claimed", "limit")
+Vector = tuple[float, float, float]
+Bools = NDArray[np.bool_]
+Floats = NDArray[np.float64]
+_FLAGS = tuple((int(flag), flag.name.lower()) for flag in PickFlag if flag.name)
+_SOURCES = {int(source): source.name.lower() for source in DepthSource}
+UNIT_TOLERANCE = 1e-3
+# Beyond these a number is not a measurement.
+FARTHEST_M, SMALLEST_M = 100.0, 0.0001
+
+
+class Workspace(BaseModel):
+    """A box, in the frame the targets are sent in; nothing outside of it is ever sent."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    low: Vector = Field(description="corner with the smallest x, y, z, m")
+    high: Vector = Field(description="corner with the largest x, y, z, m")
+
+    @model_validator(mode="after")
+    def _not_empty(self) -> Workspace:
+        if not all(a < b for a, b in zip(self.low, self.high, strict=True)):
+            raise ValueError("each coordinate of low must be less than that of high")
+        return self
+
+    def contains(self, position: Floats) -> Bools:
+        """Return for (N, 3) positions, m, whether they lie inside."""
+        inside = (position >= self.low) & (position <= self.high)
+        return np.asarray(inside.all(axis=1))
+
+
+class Mount(BaseModel):
+    """Where the camera is: its pose in the frame the robot works in."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    frame: str = Field(min_length=1, max_length=64, description="name of the robot's frame")
+    position: Vector = Field(description="the camera's origin in that frame, m")
+    quaternion: tuple[float, float, float, float] = Field(
+        description="rotation from the camera's frame to that frame, x y z w"
+    )
+
+    @field_validator("quaternion")
+    @classmethod
+    def _unit(cls, value: tuple[float, ...]) -> tuple[float, ...]:
+        if abs(sum(q * q for q in value) - 1) > UNIT_TOLERANCE:
+            raise ValueError("the quaternion must have length 1")
+        return value
+
+    def apply(self, table: _Table) -> None:
+        """Re-express a table in the robot's frame, in place."""
+        from scipy.spatial.transform import Rotation
+
+        rotation = Rotation.from_quat(self.quaternion)
+        matrix = rotation.as_matrix()
+        table.position = table.position @ matrix.T + self.position
+        table.axis = table.axis @ matrix.T
+        table.sigma_position = np.sqrt(table.sigma_position**2 @ (matrix**2).T)
+        known = table.oriented
+        if known.any():
+            table.quaternion[known] = (
+                rotation * Rotation.from_quat(table.quaternion[known])
+            ).as_quat()
+        table.frame = self.frame
+
+
+@dataclass(frozen=True)
+class Target:
+    """One target, ready to leave.
+
+    Attributes:
+        id: The pick's id.
+        json: The target as a JSON object.
+        row: Position m (3), quaternion xyzw (4, zeros where unknown), diameter m (0 where unknown).
+        flags: `PickFlag` bits.
+    """
+
+    id: int
+    json: bytes
+    row: tuple[float, ...]
+    flags: int
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The targets of one frame, best first, and how many picks were withheld, by reason."""
+
+    frame: str
+    targets: tuple[Target, ...]
+    withheld: Mapping[Reason, int]
+
+
+class _Table:
+    """The picks as arrays that may be changed."""
+
+    def __init__(self, picks: Picks) -> None:
+        self.frame = picks.frame_id
+        self.id = picks.id
+        self.position = picks.position.copy()
+        self.axis = picks.axis.copy()
+        self.quaternion = picks.quaternion.copy()
+        self.diameter = picks.diameter
+        self.score = picks.score
+        self.sigma_position = picks.sigma_position.copy()
+        self.sigma_diameter = picks.sigma_diameter
+        self.sigma_tilt = picks.sigma_tilt
+        self.source = picks.source
+        self.flags = picks.flags
+        finite = np.isfinite(self.quaternion).all(axis=1) & np.isfinite(self.axis).all(axis=1)
+        self.oriented = finite & ((self.flags & PickFlag.POSE_UNKNOWN) == 0)
+
+
+class Filter:
+    """Turns picks into targets."""
+
+    def __init__(
+        self,
+        allow_estimated: bool = False,
+        workspace: Workspace | None = None,
+        mount: Mount | None = None,
+        limit: int = 200,
+    ) -> None:
+        self._allow_estimated = allow_estimated
+        self._workspace = workspace
+        self._mount = mount
+        self._limit = limit
+
+    def __call__(self, picks: Picks) -> Choice:
+        """Return what may be sent of one frame's picks."""
+        table = _Table(picks)
+        with np.errstate(all="ignore"):
+            if self._mount is not None:
+                self._mount.apply(table)
+            left, withheld = self._sieve(table)
+            order = left[np.lexsort((table.id[left], -table.score[left]))]
+            withheld["limit"] = max(0, len(order) - self._limit)
+            return Choice(table.frame, _targets(table, order[: self._limit]), withheld)
+
+    def _sieve(self, table: _Table) -> tuple[NDArray[np.intp], dict[Reason, int]]:
+        bad: dict[Reason, Bools] = {
+            "no_depth": _no_depth(table),
+            "estimated": _estimated(table) & (not self._allow_estimated),
+            "invalid": ~_valid(table),
+        }
+        if self._workspace is not None:
+            bad["workspace"] = ~self._workspace.contains(table.position)
+        left = np.ones(len(table.id), bool)
+        withheld: dict[Reason, int] = dict.fromkeys(REASONS, 0)
+        for reason, rows in bad.items():
+            withheld[reason] = int((left & rows).sum())
+            left &= ~rows
+        return np.flatnonzero(left), withheld
+
+
+def _no_depth(table: _Table) -> Bools:
+    flagged = (table.flags & PickFlag.DEPTH_MISSING) != 0
+    return np.asarray(flagged | (table.source == DepthSource.MISSING))
+
+
+def _estimated(table: _Table) -> Bools:
+    # Anything but a measurement is a guess, whether or not its producer set the flag.
+    flagged = (table.flags & PickFlag.DEPTH_ESTIMATED) != 0
+    return np.asarray(flagged | (table.source != DepthSource.MEASURED))
+
+
+def _valid(table: _Table) -> Bools:
+    # A sigma that is infinite says the measurement failed; NaN only that nobody estimated it.
+    sigmas = np.column_stack([table.sigma_position, table.sigma_diameter, table.sigma_tilt])
+    good = ~(np.isinf(sigmas) | (sigmas < 0)).any(axis=1)
+    good &= (np.abs(table.position) <= FARTHEST_M).all(axis=1)
+    good &= (table.score >= 0) & (table.score <= 1) & (table.id >= 0)
+    sized = (table.diameter >= SMALLEST_M) & (table.diameter <= FARTHEST_M)
+    good &= sized | np.isnan(table.diameter)
+    for direction in (table.quaternion, table.axis):
+        unit = np.abs(np.linalg.norm(direction, axis=1) - 1) <= UNIT_TOLERANCE
+        good &= unit | ~table.oriented
+    return np.asarray(good)
+
+
+def _unit(rows: Floats) -> list[list[float]]:
+    """Return rows of length 1 to six decimals, also where they were so only nearly."""
+    units: list[list[float]] = np.round(
+        rows / np.linalg.norm(rows, axis=1, keepdims=True), 6
+    ).tolist()
+    return units
+
+
+def _targets(table: _Table, rows: NDArray[np.intp]) -> tuple[Target, ...]:
+    """Encode rows; a micrometre and a millionth are finer than any camera."""
+    position = np.round(table.position, 6).tolist()
+    quaternion, approach = _unit(table.quaternion), _unit(-table.axis)
+    diameter = np.round(table.diameter, 6).tolist()
+    score = np.round(table.score, 4).tolist()
+    spread = np.round(table.sigma_position, 6).tolist()
+    size_spread = np.round(table.sigma_diameter, 6).tolist()
+    tilt = np.round(table.sigma_tilt, 6).tolist()
+    found = []
+    for i in rows.tolist():
+        oriented = bool(table.oriented[i])
+        flags = int(table.flags[i]) | (0 if oriented else int(PickFlag.POSE_UNKNOWN))
+        # orjson writes NaN as null, which is what these fields mean by it.
+        content: dict[str, Any] = {
+            "id": f"m{table.id[i]}",
+            "position": position[i],
+            "orientation": quaternion[i] if oriented else None,
+            "approach": approach[i] if oriented else None,
+            "diameter": diameter[i],
+            "score": score[i],
+            "sigma": {
+                "position": None if np.isnan(spread[i]).any() else spread[i],
+                "diameter": size_spread[i],
+                "tilt": tilt[i],
+            },
+            "depth": _SOURCES[int(table.source[i])],
+            "flags": [name for bit, name in _FLAGS if bit & flags],
+        }
+        pose = quaternion[i] if oriented else (0.0,) * 4
+        size = diameter[i] if diameter[i] == diameter[i] else 0.0
+        found.append(
+            Target(int(table.id[i]), orjson.dumps(content), (*position[i], *pose, size), flags)
+        )
+    return tuple(found)

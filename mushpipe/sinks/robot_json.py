@@ -1,0 +1,221 @@
+"""Sink `robot-json`: offers picks to robots over TCP; the protocol is docs/robot.md."""
+
+from __future__ import annotations
+
+import logging
+import re
+import ssl
+from collections.abc import Mapping
+from importlib.metadata import version
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field, PrivateAttr
+
+from mushpipe import GraphPath, Picks, RunInfo, Sink, Trace
+from mushpipe.core.errors import EXIT_NO_DEVICE, UsageError
+from mushpipe.robot.abb import AbbSession
+from mushpipe.robot.clock import Clock, Placer
+from mushpipe.robot.connection import Limits
+from mushpipe.robot.hub import Ending, Hub, Settings
+from mushpipe.robot.server import Listener, Opener, Options, RobotServer
+from mushpipe.robot.session import JsonSession
+from mushpipe.robot.targets import Filter, Mount, Workspace
+from mushpipe.robot.transcript import Transcript
+
+logger = logging.getLogger("mushpipe")
+# Sensor stamps further from the host's clock than this are in a clock of their own.
+SAME_CLOCK_NS = 2 * 10**9
+
+
+class RobotJsonSink(Sink):
+    """Offers picks to robots as JSON lines over TCP, or as short lines for ABB controllers.
+
+    It is a server on the loopback address unless told otherwise. Nothing older than `max_age_ms`
+    is ever sent, and nothing whose depth is a guess. A recording is served only with `replay`, and
+    then every message says so.
+    """
+
+    delivery: ClassVar[Literal["every", "latest"]] = "latest"
+
+    port: int = Field(5005, ge=0, le=65535, description="TCP port; 0 takes a free one")
+    bind: str = Field(
+        "127.0.0.1", description="address to listen on; any but loopback needs a token or TLS"
+    )
+    format: Literal["json", "abb"] = Field("json", description="what is spoken on `port`")
+    abb_port: int | None = Field(
+        None, ge=0, le=65535, description="speak the lines for ABB on this port as well"
+    )
+    max_age_ms: float = Field(500, gt=0, le=10_000, description="nothing older is ever sent")
+    sensor_latency_ms: float = Field(
+        0, ge=0, le=1000, description="time from exposure to the stamp, added to every age"
+    )
+    stall_ms: float = Field(
+        1000, ge=100, le=1500, description="without a result for so long, robots are told"
+    )
+    allow_estimated: bool = Field(False, description="send targets whose depth is a guess")
+    workspace: Workspace | None = Field(
+        None, description="box in the targets' frame; nothing outside is sent"
+    )
+    mount: Mount | None = Field(
+        None, description="pose of the camera in the robot's frame; targets are sent in that frame"
+    )
+    max_targets: int = Field(200, ge=1, le=1000, description="the best so many are sent")
+    claim_s: float = Field(
+        60, gt=0, le=3600, description="an accepted target comes back after so long without a word"
+    )
+    replay: bool = Field(False, description="serve recordings; every message says that it is one")
+    max_clients: int = Field(8, ge=1, le=64, description="more are turned away")
+    lines_per_s: float = Field(200, ge=10, le=100_000, description="a client that says more waits")
+    token_file: GraphPath | None = Field(
+        None, description="file with a secret that clients must know, 16 characters or more"
+    )
+    tls_cert: GraphPath | None = Field(None, description="certificate chain, PEM; turns TLS on")
+    tls_key: GraphPath | None = Field(None, description="private key, PEM; in tls_cert if not set")
+    tls_client_ca: GraphPath | None = Field(
+        None, description="clients must show a certificate signed by this one, PEM"
+    )
+    transcript: GraphPath | None = Field(
+        None, description="MCAP file for every line out and in; {recording} is the input's name"
+    )
+
+    _clock: Clock = PrivateAttr(default_factory=Clock)
+    _placer: Placer | None = PrivateAttr(None)
+    _filter: Filter | None = PrivateAttr(None)
+    _server: RobotServer | None = PrivateAttr(None)
+    _transcript: Transcript | None = PrivateAttr(None)
+    _ending: Ending = PrivateAttr("failed")
+    _live: bool = PrivateAttr(False)
+    _warned: bool = PrivateAttr(False)
+
+    def files(self, run: RunInfo) -> tuple[Path, ...]:
+        """Return the transcript."""
+        return (run.path(self.transcript),) if self.transcript else ()
+
+    def open(self, run: RunInfo) -> None:
+        """Begin to listen.
+
+        Raises:
+            UsageError: The source is a recording and `replay` is not set, the address is open to
+                the network without token or TLS, or cannot be listened on.
+        """
+        if not run.live and not self.replay:
+            raise UsageError(
+                "the source plays a recording, which a robot would take for the bed before it; "
+                "set 'replay: true' to serve it, marked as a recording"
+            )
+        token = self._token()
+        tls = self._tls()
+        if not _is_loopback(self.bind) and not (token or tls):
+            raise UsageError(
+                f"'bind: {self.bind}' is open to the network: set 'token_file', or 'tls_cert'"
+            )
+        self._live = run.live
+        self._placer = Placer(self._clock)
+        self._filter = Filter(self.allow_estimated, self.workspace, self.mount, self.max_targets)
+        hub = Hub(self._settings(run.live, token), self._clock, run.frames_read)
+        options = Options(
+            self._listeners(), Limits(lines_per_s=self.lines_per_s), self.max_clients, tls
+        )
+        if self.transcript:
+            self._transcript = Transcript(run.path(self.transcript), self._clock, token)
+            self._server = RobotServer(hub, options, self._transcript.observe)
+        else:
+            self._server = RobotServer(hub, options)
+        self._server.start()
+        ports = " and ".join(map(str, self._server.ports))
+        kind = "live" if run.live else "a recording, marked as such"
+        logger.info("robots are served at %s, port %s: %s", self.bind, ports, kind)
+
+    def _settings(self, live: bool, token: str) -> Settings:
+        return Settings(
+            max_age_s=self.max_age_ms / 1000,
+            stall_s=self.stall_ms / 1000,
+            claim_s=self.claim_s,
+            replay=not live,
+            token=token,
+            software=f"mushpipe {version('mushpipe')}",
+        )
+
+    def _listeners(self) -> tuple[Listener, ...]:
+        first: Opener = AbbSession if self.format == "abb" else JsonSession
+        lines = () if self.abb_port is None else (Listener(self.bind, self.abb_port, AbbSession),)
+        return (Listener(self.bind, self.port, first), *lines)
+
+    def _token(self) -> str:
+        if self.token_file is None:
+            return ""
+        try:
+            token = self.token_file.read_text().strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise UsageError(f"{self.token_file}: cannot be read: {error}") from error
+        if not re.fullmatch(r"[A-Za-z0-9_.~-]{16,40}", token):
+            raise UsageError(
+                f"{self.token_file}: a token has 16 to 40 characters of A-Z a-z 0-9 _ . ~ -"
+            )
+        return token
+
+    def _tls(self) -> ssl.SSLContext | None:
+        if self.tls_cert is None:
+            if self.tls_key or self.tls_client_ca:
+                raise UsageError("TLS needs 'tls_cert'")
+            return None
+        try:
+            context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+            context.load_cert_chain(self.tls_cert, self.tls_key)
+            if self.tls_client_ca:
+                context.load_verify_locations(self.tls_client_ca)
+                context.verify_mode = ssl.CERT_REQUIRED
+        except OSError as error:
+            raise UsageError(f"TLS cannot be set up with {self.tls_cert}: {error}") from error
+        return context
+
+    def consume(self, picks: Picks, trace: Trace) -> None:
+        """Offer one frame's picks in place of the last one's; never waits for a robot."""
+        if self._server is None or self._filter is None:
+            raise RuntimeError("the sink is not open")
+        header = trace.frame.header
+        choice = self._filter(picks)
+        self._server.hub.publish(choice, header.sequence, header.stamp_ns, self._taken(trace))
+        self._server.wake()
+
+    def _taken(self, trace: Trace) -> float:
+        """Return the monotonic time a frame was taken at, s; minus infinity where unknown.
+
+        Of a recording only the time since it was played can be told, and that is its age.
+        """
+        header, now = trace.frame.header, self._clock.monotonic()
+        processed = now - sum(trace.durations_ns.values()) / 1e9
+        if not self._live or self._placer is None:
+            return processed
+        same_clock = 0 <= header.arrival_ns - header.stamp_ns <= SAME_CLOCK_NS
+        placed = self._placer.place(header.stamp_ns if same_clock else header.arrival_ns)
+        if placed is None:
+            if not self._warned:
+                self._warned = True
+                logger.warning("the camera's time stamps are not of this host: robots get nothing")
+            return float("-inf")
+        return min(placed, processed) - self.sensor_latency_ms / 1000
+
+    def finish(self, summary: Mapping[str, Any]) -> None:
+        """Note how the run ended, for the robots' last word."""
+        code = summary.get("exit_code")
+        endings: dict[Any, Ending] = {0: "end", EXIT_NO_DEVICE: "no_camera"}
+        self._ending = endings.get(code, "failed")
+
+    def close(self) -> None:
+        """Take leave of the robots."""
+        if self._server is not None:
+            self._server.stop(self._ending)
+            self._server = None
+        if self._transcript is not None:
+            self._transcript.close()
+            self._transcript = None
+
+
+def _is_loopback(address: str) -> bool:
+    try:
+        return ip_address(address).is_loopback
+    except ValueError:
+        raise UsageError(f"'bind: {address}' is not an IP address") from None

@@ -1,0 +1,116 @@
+"""`mushpipe robot` and the examples, as an integrator would use them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from mushpipe.cli import app
+from mushpipe.robot import commands
+from mushpipe.robot.client import RobotClient
+from tests.robot.scene import bench
+from tests.robot.test_transcript import record
+
+ROOT = Path(__file__).parents[2]
+
+
+def robot(*arguments: object) -> Any:
+    return CliRunner().invoke(app, ["robot", *map(str, arguments)])
+
+
+def test_targets_are_printed_and_acknowledged() -> None:
+    with bench(replay=True) as b:
+        b.publish()
+        address = f"127.0.0.1:{b.port}"
+        arguments = ("--count", 2, "--every", 0, "--max", 1, "--ack", "accepted", "--ack", "done")
+        done = robot("client", address, *arguments, "--accept-replay")
+        assert done.exit_code == 0, done.output
+        assert "targets REPLAY seq=1 age=0 ms" in done.output
+        assert "target=m0 result=done effect=removed" in done.output
+        assert "1 claimed" in done.output
+        refused = robot("client", address, "--count", 1)
+        assert refused.exit_code == 1
+        assert "replay_refused" in refused.output
+
+
+def test_what_is_stale_is_shown_as_such() -> None:
+    with bench() as b:
+        done = robot("client", f"127.0.0.1:{b.port}", "--count", 1)
+        assert "code=stale" in done.output
+
+
+def test_it_tries_again_when_the_server_goes_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    with bench() as b:
+        b.publish()
+        calls = []
+
+        class Once(RobotClient):
+            def __init__(self, *arguments: Any, **more: Any) -> None:
+                calls.append(1)
+                if len(calls) == 1:
+                    raise ConnectionRefusedError("nobody there")
+                super().__init__(*arguments, **more)
+
+        monkeypatch.setattr("mushpipe.robot.client.RobotClient", Once)
+        monkeypatch.setattr(commands.time, "sleep", lambda _: None)
+        done = robot("client", f"127.0.0.1:{b.port}", "--mode", "stream", "--count", 1, "--raw")
+        assert "nobody there; trying again" in done.output
+        assert '"op": "targets"' in done.output
+
+
+def test_a_token_and_a_wrong_address(tmp_path: Path) -> None:
+    (tmp_path / "token").write_text("t" * 16 + "\n")
+    with bench(token="t" * 16) as b:
+        b.publish()
+        address = f"127.0.0.1:{b.port}"
+        done = robot("client", address, "--count", 1, "--token-file", tmp_path / "token")
+        assert "m0" in done.output
+    assert robot("client", "5005").exit_code == 2
+
+
+def test_a_transcript_is_replayed(tmp_path: Path) -> None:
+    path = tmp_path / "robot.mcap"
+    record(path)
+    with bench() as b:
+        b.publish()
+        done = robot("replay", path, "--connect", f"127.0.0.1:{b.port}")
+        assert done.exit_code == 0, done.output
+        assert "> \\xff\\xfe" in done.output
+        assert '"effect":"removed"' in done.output
+    assert robot("replay", path, "--connect", f"127.0.0.1:{b.port}").exit_code == 1
+    assert robot("replay", path).exit_code == 2
+
+
+def test_a_transcript_answers_a_client(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "robot.mcap"
+    record(path)
+    port: list[int] = []
+    ready = threading.Event()
+
+    def note(text: str) -> None:
+        if "listening" in text:
+            port.append(int(text.rpartition(":")[2]))
+            ready.set()
+
+    monkeypatch.setattr(commands, "_note", note)
+    thread = threading.Thread(target=commands.replay, args=(path, None, 0))
+    monkeypatch.setattr(commands, "_out", lambda _: None)
+    thread.start()
+    assert ready.wait(20)
+    with RobotClient(port=port[0], accept_replay=True) as client:
+        assert client.ask("get_targets")["replay"]
+    thread.join(20)
+
+
+def test_the_example_picks() -> None:
+    with bench(max_age_s=600, replay=True) as b:
+        b.publish()
+        command = [sys.executable, ROOT / "examples/robot/client.py", str(b.port)]
+        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+    assert [line.split()[0] for line in done.stdout.splitlines()] == ["m0", "m1", "m2"]

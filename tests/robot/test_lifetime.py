@@ -1,0 +1,143 @@
+"""Deaths without a last word, each followed by a clean new beginning."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+
+from mushpipe.robot.client import RobotClient
+from tests.robot.peer import Peer
+from tests.robot.scene import bench
+
+ROOT = Path(__file__).parents[2]
+ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
+CLI = [sys.executable, "-c", "from mushpipe.cli import main; main()"]
+
+
+@contextmanager
+def process(*arguments: str) -> Iterator[subprocess.Popen[str]]:
+    with subprocess.Popen(
+        arguments,
+        env=ENVIRONMENT,
+        text=True,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    ) as child:
+        try:
+            yield child
+        finally:
+            child.kill()
+
+
+@contextmanager
+def served(port: int = 0) -> Iterator[tuple[subprocess.Popen[str], int]]:
+    with process(sys.executable, "-m", "tests.robot.serve", str(port)) as child:
+        assert child.stdout
+        yield child, int(child.stdout.readline())
+
+
+def test_the_server_is_killed_and_comes_back() -> None:
+    with served() as (child, port), Peer(port) as peer:
+        first = peer.greet("stream")["session"]
+        while peer.wait("targets")["seq"] < 20:
+            pass
+        child.kill()
+        assert all(m["op"] in ("targets", "heartbeat") for m in peer.rest())
+    with served(port) as (_, again), Peer(again) as peer:
+        assert again == port
+        assert peer.greet("stream")["session"] != first
+        message = peer.wait("targets")
+        assert message["age_ms"] <= 500
+
+
+def test_the_reference_client_is_killed_and_comes_back() -> None:
+    with bench() as b:
+        b.publish()
+        command = [*CLI, "robot", "client", f"127.0.0.1:{b.port}", "--raw", "--mode", "stream"]
+        with process(*command) as child:
+            assert child.stdout
+            while json.loads(child.stdout.readline())["op"] != "targets":
+                pass
+            child.kill()
+            b.until("event", b"disconnected")
+        b.publish()
+        b.publish()
+        with process(*command) as child:
+            assert child.stdout
+            message = json.loads(child.stdout.readline())
+            while message["op"] != "targets":
+                message = json.loads(child.stdout.readline())
+            assert message["seq"] == 3
+
+
+class Cable:
+    """A wire that can be cut without either end being told."""
+
+    def __init__(self, port: int) -> None:
+        self.cut = threading.Event()
+        self.far = socket.create_connection(("127.0.0.1", port))
+        self.listening = socket.create_server(("127.0.0.1", 0))
+        self.port = self.listening.getsockname()[1]
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def _run(self) -> None:
+        self.near, _ = self.listening.accept()
+        threading.Thread(target=self._carry, args=(self.near, self.far), daemon=True).start()
+        self._carry(self.far, self.near)
+
+    def _carry(self, source: socket.socket, target: socket.socket) -> None:
+        with suppress(OSError):
+            while data := source.recv(65536):
+                if not self.cut.is_set():
+                    target.sendall(data)
+
+    def close(self) -> None:
+        for sock in (self.far, self.near, self.listening):
+            sock.close()
+
+
+def test_the_network_is_cut() -> None:
+    with bench() as b:
+        b.publish()
+        cable = Cable(b.port)
+        with RobotClient(port=cable.port, timeout_s=1.0) as robot:
+            assert len(robot.targets()) == 3
+            cable.cut.set()
+            with pytest.raises(TimeoutError):
+                robot.targets()
+        # The server notices by itself that nothing is heard, or that nothing is taken.
+        b.advance_until_disconnected(5)
+        cable.close()
+        b.publish()
+        with RobotClient(port=b.port) as robot:
+            answer = robot.ask("get_targets")
+            assert (answer["seq"], answer["age_ms"]) == (2, 0)
+
+
+def test_the_reference_client() -> None:
+    with bench(token="t" * 16) as b:
+        b.publish()
+        with pytest.raises(PermissionError, match="unauthorised"):
+            RobotClient(port=b.port)
+        with RobotClient(port=b.port, token="t" * 16, name="irb") as robot:
+            assert [t["id"] for t in robot.targets(max=2)] == ["m0", "m1"]
+            assert robot.ack("m0", "accepted")
+            assert not robot.ack("m9", "accepted")
+            assert [t["id"] for t in robot.targets(max=2)] == ["m1", "m2"]
+            b.advance(0.6)
+            assert robot.targets() == []
+            b.server.stop("failed")
+            while robot.receive()["op"] != "bye":
+                pass
+            with pytest.raises(OSError, match="gone"):
+                robot.receive()

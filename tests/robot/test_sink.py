@@ -1,0 +1,205 @@
+"""The sink: what it refuses, and how ages count."""
+
+from __future__ import annotations
+
+import ssl
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mushpipe import Header, RgbdFrame, RunInfo, Trace
+from mushpipe.core.errors import UsageError
+from mushpipe.robot.client import RobotClient
+from mushpipe.robot.clock import STEP_S, Placer
+from mushpipe.robot.hub import Hub, Settings
+from mushpipe.robot.messages import Refusal
+from mushpipe.sinks import robot_json
+from mushpipe.sinks.robot_json import RobotJsonSink
+from tests.robot.peer import Peer
+from tests.robot.scene import FakeClock, choice, make_picks
+
+LIVE = RunInfo("test", {}, live=True)
+
+
+def frame_at(stamp_ns: int, arrival_ns: int = 0) -> RgbdFrame:
+    header = Header(stamp_ns, 5, "camera_color_optical_frame", arrival_ns)
+    return RgbdFrame(header, np.zeros((4, 4, 3), np.uint8))
+
+
+@pytest.fixture
+def sink() -> Iterator[RobotJsonSink]:
+    sink = RobotJsonSink(port=0)
+    sink._clock = FakeClock()
+    yield sink
+    sink.close()
+
+
+def port(sink: RobotJsonSink) -> int:
+    assert sink._server
+    return sink._server.ports[0]
+
+
+def consume(sink: RobotJsonSink, stamp_ns: int, arrival_ns: int = 0, spent_s: float = 0) -> None:
+    durations = {"locate": round(spent_s * 1e9)}
+    sink.consume(make_picks(), Trace(frame_at(stamp_ns, arrival_ns), {}, durations))
+
+
+def ages(sink: RobotJsonSink, *frame: Any) -> int | None:
+    """Return the age in ms of a frame that was just consumed, None where it is unknown."""
+    consume(sink, *frame)
+    assert sink._server
+    return sink._server.hub.age_ms(sink._clock.monotonic())
+
+
+def test_a_recording_is_not_served_unless_the_graph_says_so(sink: RobotJsonSink) -> None:
+    with pytest.raises(UsageError, match="replay: true"):
+        sink.open(RunInfo("test", {}))
+
+
+@pytest.mark.parametrize("address", ["0.0.0.0", "::", "192.0.2.1"])
+def test_the_network_is_not_served_without_token_or_tls(address: str) -> None:
+    with pytest.raises(UsageError, match="open to the network"):
+        RobotJsonSink(port=0, bind=address).open(LIVE)
+
+
+def test_settings_that_cannot_be_meant(tmp_path: Path) -> None:
+    short = tmp_path / "token"
+    short.write_text("short\n")
+    cases = [
+        ({"token_file": short}, "16 to 40 characters"),
+        ({"token_file": tmp_path / "none"}, "cannot be read"),
+        ({"tls_cert": short}, "TLS cannot be set up"),
+        ({"tls_client_ca": short}, "needs 'tls_cert'"),
+        ({"bind": "localhost"}, "not an IP address"),
+    ]
+    for chosen, text in cases:
+        with pytest.raises(UsageError, match=text):
+            RobotJsonSink.model_validate({"port": 0, **chosen}).open(LIVE)
+
+
+def test_with_a_token_and_tls_the_network_is_served(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, certificate: Path
+) -> None:
+    # Tests stay on loopback; it plays the network.
+    monkeypatch.setattr(robot_json, "_is_loopback", lambda _: False)
+    (tmp_path / "token").write_text("t" * 16 + "\n")
+    trusting = ssl.create_default_context(cafile=certificate)
+    with_token = {"token_file": tmp_path / "token"}
+    with_tls = {"tls_cert": certificate, "tls_client_ca": certificate}
+    for chosen in (with_token, with_tls, with_token | with_tls):
+        sink = RobotJsonSink.model_validate({"port": 0, **chosen})
+        sink.open(LIVE)
+        hello = {"token": "t" * 16} if "token_file" in chosen else {}
+        context = trusting if "tls_cert" in chosen else None
+        if context:
+            with pytest.raises(OSError):  # noqa: PT011 - it has no certificate to show
+                RobotClient(port=port(sink), tls=context, **hello)
+            context.load_cert_chain(certificate)
+        with RobotClient(port=port(sink), tls=context, **hello) as robot:
+            assert robot.ask("ping")["op"] == "pong"
+        trusting = ssl.create_default_context(cafile=certificate)
+        sink.close()
+
+
+@given(
+    steps=st.lists(
+        st.tuples(st.floats(0, 0.6), st.floats(-2, 2) | st.just(0), st.booleans()), max_size=25
+    ),
+    limit_ms=st.integers(1, 2000),
+)
+@settings(max_examples=100, deadline=None)
+def test_however_the_wall_clock_jumps_nothing_too_old_is_fresh(
+    steps: list[tuple[float, float, bool]], limit_ms: int
+) -> None:
+    """The safety rule itself, against the truth that only the test knows."""
+    sink = RobotJsonSink(port=0, max_age_ms=limit_ms)
+    sink._clock = clock = FakeClock()
+    sink._live = True
+    sink._placer = Placer(clock)
+    hub = Hub(Settings(max_age_s=limit_ms / 1000), clock)
+    taken = None
+    for pause, jump, publish in steps:
+        moment, stamp = clock.now, clock.wall_ns()
+        clock.now += pause
+        clock.offset_s += jump
+        if publish:
+            trace = Trace(frame_at(stamp, stamp), {}, {})
+            hub.publish(choice(), 1, stamp, sink._taken(trace))
+            taken = moment
+        with suppress(Refusal):
+            hub.fresh(clock.now, 1e9)
+            assert taken is not None
+            assert clock.now - taken <= limit_ms / 1000 + 2 * STEP_S
+
+
+def test_a_port_that_is_taken(sink: RobotJsonSink) -> None:
+    sink.open(LIVE)
+    with pytest.raises(UsageError, match="cannot listen on"):
+        RobotJsonSink(port=port(sink)).open(LIVE)
+
+
+def test_an_age_counts_from_the_camera_on_the_monotonic_clock(sink: RobotJsonSink) -> None:
+    sink.open(LIVE)
+    clock = sink._clock
+    assert isinstance(clock, FakeClock)
+    stamp = clock.wall_ns()
+    clock.now += 0.1
+    assert ages(sink, stamp, stamp + 30_000_000) == 100
+    # The camera's clock is not the host's: the arrival counts.
+    assert ages(sink, 12345, stamp + 30_000_000) == pytest.approx(70, abs=1)
+    # No stamp makes a frame younger than the time its stages took.
+    assert ages(sink, clock.wall_ns(), clock.wall_ns(), 0.25) == 250
+    # Set back by an hour while the frame was on its way.
+    stamp = clock.wall_ns()
+    clock.now += 0.2
+    clock.offset_s -= 3600
+    assert ages(sink, stamp, stamp) == pytest.approx(200, abs=1)
+    assert ages(sink, clock.wall_ns() + 10**10) is None
+
+
+def test_a_frame_whose_age_nobody_knows_is_stale(
+    sink: RobotJsonSink, caplog: pytest.LogCaptureFixture
+) -> None:
+    sink.open(LIVE)
+    with Peer(port(sink)) as peer:
+        peer.greet()
+        consume(sink, 12345)
+        answer = peer.ask("get_targets", id=1)
+        assert (answer["code"], answer["age_ms"]) == ("stale", None)
+    assert "not of this host" in caplog.text
+
+
+def test_the_latency_of_the_sensor_is_added() -> None:
+    sink = RobotJsonSink(port=0, sensor_latency_ms=40)
+    sink._clock = clock = FakeClock()
+    sink.open(LIVE)
+    stamp = clock.wall_ns()
+    clock.now += 0.1
+    assert ages(sink, stamp, stamp) == 140
+    sink.close()
+
+
+def test_a_recording_ages_from_the_moment_it_is_played() -> None:
+    sink = RobotJsonSink(port=0, replay=True)
+    sink._clock = FakeClock()
+    sink.open(RunInfo("test", {}))
+    assert ages(sink, 12345, 12345, 0.02) == 20
+    with Peer(port(sink)) as peer:
+        peer.greet(accept_replay=True)
+        answer = peer.ask("get_targets", id=1)
+        assert (answer["replay"], answer["stamp"]) == (True, {"sec": 0, "nsec": 12345})
+    sink.close()
+
+
+def test_a_live_source_is_live_even_where_recordings_are_permitted() -> None:
+    sink = RobotJsonSink(port=0, replay=True)
+    sink.open(LIVE)
+    with Peer(port(sink)) as peer:
+        assert not peer.greet()["replay"]
+    sink.close()

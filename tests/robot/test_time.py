@@ -1,0 +1,179 @@
+"""Ages and states on clocks that jump."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mushpipe.robot.clock import MEMORY_S, TOLERANCE_S, Clock, Placer
+from mushpipe.robot.hub import Hub, Settings
+from mushpipe.robot.ledger import FORGET_S, Ledger
+from mushpipe.robot.messages import Refusal
+from tests.robot.scene import FakeClock, choice
+
+
+def test_a_stamp_is_placed_where_it_was_taken() -> None:
+    clock = FakeClock()
+    placer = Placer(clock)
+    stamp = clock.wall_ns()
+    clock.now += 0.3
+    assert placer.place(stamp) == pytest.approx(clock.now - 0.3, abs=1e-5)
+
+
+@pytest.mark.parametrize("jump", [-3600.0, -30.0, 0.5, 3600.0])
+def test_a_jump_of_the_wall_clock_changes_no_age(jump: float) -> None:
+    clock = FakeClock()
+    placer = Placer(clock)
+    clock.now += 60
+    placer.sample()
+    before = clock.wall_ns()
+    clock.now += 0.1
+    clock.offset_s += jump
+    assert placer.place(before) == pytest.approx(clock.now - 0.1, abs=1e-5)
+    clock.now += 0.1
+    after = clock.wall_ns()
+    clock.now += 0.2
+    assert placer.place(after) == pytest.approx(clock.now - 0.2, abs=1e-5)
+
+
+def test_an_hour_that_the_clock_showed_twice_counts_as_the_first_one() -> None:
+    clock = FakeClock()
+    placer = Placer(clock)
+    clock.now += 60
+    placer.sample()
+    clock.offset_s -= 2
+    stamp = clock.wall_ns()
+    clock.now += 0.1
+    assert placer.place(stamp) == pytest.approx(clock.now - 2.1, abs=1e-5)
+    clock.now += 2.2
+    stamp = clock.wall_ns()
+    assert placer.place(stamp) == pytest.approx(clock.now, abs=1e-5)
+
+
+@pytest.mark.parametrize("seconds", [1.0, 1e9, -20.0, -1e9])
+def test_stamps_of_another_clock_have_no_place(seconds: float) -> None:
+    clock = FakeClock()
+    assert Placer(clock).place(clock.wall_ns() + round(seconds * 1e9)) is None
+
+
+@given(
+    steps=st.lists(st.tuples(st.floats(0, 3), st.floats(-5, 5)), min_size=1, max_size=30),
+    delay=st.floats(0, 5),
+)
+def test_no_stamp_is_ever_placed_later_than_it_was_taken(
+    steps: list[tuple[float, float]], delay: float
+) -> None:
+    clock = FakeClock()
+    placer = Placer(clock)
+    taken: list[tuple[int, float]] = []
+    for pause, jump in steps:
+        taken.append((clock.wall_ns(), clock.now))
+        clock.now += pause
+        clock.offset_s += jump
+        placer.sample()
+    clock.now += delay
+    for stamp, moment in taken:
+        placed = placer.place(stamp)
+        if clock.now - moment < MEMORY_S:
+            assert placed is None or placed <= moment + TOLERANCE_S + 1e-5
+
+
+def test_the_real_clocks_tick() -> None:
+    clock = Clock()
+    first = clock.monotonic()
+    assert clock.monotonic() >= first
+    placed = Placer(clock).place(clock.wall_ns())
+    assert placed is not None
+    assert placed >= first - TOLERANCE_S
+
+
+def hub_on(clock: FakeClock, **settings: float | bool) -> tuple[Hub, list[int]]:
+    frames = [0]
+    return Hub(Settings(**settings), clock, lambda: frames[0]), frames  # type: ignore[arg-type]
+
+
+def test_nothing_older_than_allowed_is_fresh() -> None:
+    clock = FakeClock()
+    hub, _ = hub_on(clock, max_age_s=0.5)
+    with pytest.raises(Refusal, match="no result yet"):
+        hub.fresh(clock.now, 10)
+    hub.publish(choice(), 0, 0, clock.now - 0.3)
+    assert hub.fresh(clock.now, 10).seq == 1
+    assert hub.fresh(clock.now + 0.19, 10).seq == 1
+    for age_limit, later in ((10, 0.21), (0.29, 0.0)):
+        with pytest.raises(Refusal, match="too old") as caught:
+            hub.fresh(clock.now + later, age_limit)
+        assert caught.value.code == "stale"
+
+
+def test_a_result_of_unknown_age_is_never_fresh() -> None:
+    clock = FakeClock()
+    hub, _ = hub_on(clock)
+    hub.publish(choice(), 0, 0, float("-inf"))
+    with pytest.raises(Refusal, match="too old"):
+        hub.fresh(clock.now, 1e9)
+    assert hub.age_ms(clock.now) is None
+
+
+def test_a_result_from_the_future_is_one_of_now() -> None:
+    clock = FakeClock()
+    hub, _ = hub_on(clock, max_age_s=0.5)
+    hub.publish(choice(), 0, 0, clock.now + 100)
+    with pytest.raises(Refusal, match="too old"):
+        hub.fresh(clock.now + 1, 10)
+
+
+def test_the_state_tells_a_stalled_pipeline_from_a_lost_camera() -> None:
+    clock = FakeClock()
+    hub, frames = hub_on(clock, stall_s=1.0)
+    assert hub.state(clock.now) == "no_camera"
+    frames[0] = 1
+    hub.tick(clock.now)
+    assert hub.state(clock.now) == "stalled"
+    hub.publish(choice(), 0, 0, clock.now)
+    assert hub.state(clock.now) == "running"
+    clock.now += 1.1
+    frames[0] = 30
+    hub.tick(clock.now)
+    assert hub.state(clock.now) == "stalled"
+    clock.now += 1.1
+    hub.tick(clock.now)
+    assert hub.state(clock.now) == "no_camera"
+
+
+def test_a_recording_has_no_camera_to_lose() -> None:
+    clock = FakeClock()
+    hub, _ = hub_on(clock, replay=True)
+    assert hub.state(clock.now) == "stalled"
+
+
+def test_an_accepted_target_comes_back_when_nothing_is_heard() -> None:
+    ledger = Ledger(claim_s=60)
+    assert ledger.apply("a", 1, "accepted", 0, visible=True, now=0) == "removed"
+    ledger.settle(59)
+    assert ledger.hidden() == {1}
+    assert ledger.apply("a", 1, "accepted", 0, visible=True, now=59) == "removed"
+    ledger.settle(100)
+    assert ledger.hidden() == {1}
+    version = ledger.version
+    ledger.settle(119)
+    assert ledger.hidden() == set()
+    assert ledger.version != version
+
+
+def test_what_is_done_stays_away_while_it_is_seen_and_is_forgotten_later() -> None:
+    ledger = Ledger()
+    ledger.apply("a", 1, "done", 0, visible=True, now=0)
+    ledger.see([1, 2], now=1e6)
+    ledger.settle(1e6 + FORGET_S - 1)
+    assert ledger.hidden() == {1}
+    ledger.settle(1e6 + FORGET_S)
+    assert ledger.hidden() == set()
+
+
+def test_a_target_can_be_kept_away_for_a_while() -> None:
+    ledger = Ledger()
+    assert ledger.apply("a", 1, "rejected", 5, visible=True, now=0) == "removed"
+    ledger.settle(5)
+    assert ledger.hidden() == set()
