@@ -1,0 +1,244 @@
+"""All caps of a frame: sampling, fitting, and what follows from the fitted parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mushpipe.core.jit import jit
+from mushpipe.stages.cap_model import HEIGHT, N, RADIUS, SIZE, UNKNOWNS, Floats, meet, slope
+from mushpipe.stages.cap_samples import (
+    CELLS,
+    COMPASS,
+    DIRECTIONS,
+    paint,
+    ray_at,
+    sample_depth,
+    sample_edges,
+)
+from mushpipe.stages.cap_solve import ROUND, Noise, refine, start, uncertainty
+
+
+@dataclass(frozen=True, eq=False)
+class Fits:
+    """Fitted caps in the optical frame; NaN where not valid.
+
+    Attributes:
+        valid: (N,) whether there is a fit.
+        center: (N, 3) m, of the rim plane.
+        axis: (N, 3) unit, out of the cap.
+        radius: (N,) m, of the rim.
+        height: (N,) m, of the dome.
+        apex: (N, 3) m.
+        surface: (N, 3) m, where the ray of the circle's centre meets the cap.
+        covariance: (N, 7, 7) of centre, two turns of the axis, radius, height.
+        sigma_tilt: (N,) rad.
+        sigma_radius: (N,) m.
+        sigma_surface: (N, 3) m.
+        fitness: (N,) 0..1, mean robust weight of the points of the grid, 0 for a missing one.
+        edges: (N,) number of trusted edge rays.
+    """
+
+    valid: NDArray[np.bool_]
+    center: Floats
+    axis: Floats
+    radius: Floats
+    height: Floats
+    apex: Floats
+    surface: Floats
+    covariance: Floats
+    sigma_tilt: Floats
+    sigma_radius: Floats
+    sigma_surface: Floats
+    fitness: Floats
+    edges: NDArray[np.int64]
+
+
+@jit
+def core_depth(depth: NDArray[Any], circle: Floats) -> float:
+    """Return the median native depth near the centre of a circle (x, y, r), 0 without any."""
+    values = np.empty(81)
+    n = 0
+    for i in range(-4, 5):
+        for j in range(-4, 5):
+            u = int(np.round(circle[0] + 0.12 * i * circle[2]))
+            v = int(np.round(circle[1] + 0.12 * j * circle[2]))
+            if 0 <= v < depth.shape[0] and 0 <= u < depth.shape[1] and depth[v, u] > 0:
+                values[n] = depth[v, u]
+                n += 1
+    return float(np.median(values[:n])) if n else 0.0
+
+
+@jit
+def rank_by_depth(depth: NDArray[Any], circles: Floats, labels: NDArray[np.int32]) -> Floats:
+    """Paint all circles, the nearest last, and return their core depths (N,), native."""
+    far = np.empty(len(circles))
+    for i in range(len(circles)):
+        far[i] = core_depth(depth, circles[i])
+    paint(labels, circles, np.argsort(-far)[: len(far)])
+    return far
+
+
+@jit
+def gather(
+    i: int,
+    image: Any,
+    circles: Floats,
+    far: Floats,
+    focal: float,
+    sensor: tuple[float, float, float, float],
+    data: Any,
+) -> tuple[int, int, float]:
+    """Take the data of cap i; return numbers of points and edge rays, and the middle depth (m)."""
+    depth, scale, rays, labels = image
+    points, edges, outline = data
+    hides = np.zeros(len(circles) + 1, np.bool_)
+    for k in range(len(circles)):
+        hides[k + 1] = k != i and 0.0 < far[k] < far[i]
+    noise = (sensor[0], sensor[1])
+    circle = circles[i]
+    n, middle = sample_depth(depth, scale, rays, labels, hides, circle, focal, noise, points)
+    if n == 0:
+        return 0, 0, 0.0
+    m = sample_edges(depth, scale, rays, labels, hides, circle, focal, middle, sensor[3], edges)
+    for j in range(n):
+        points[j, 3] -= sensor[2] / points[j, 2]
+    for j in range(ROUND):
+        turn = COMPASS[j * (DIRECTIONS // ROUND)]
+        x, y = circle[0] + circle[2] * turn[0], circle[1] + circle[2] * turn[1]
+        ray_at(rays, focal, x, y, outline[j])
+    return n, m, middle - sensor[2]
+
+
+@jit
+def fit_all(
+    image: Any,
+    circles: Floats,
+    focal: float,
+    up: Floats,
+    noise: Any,
+    sensor: tuple[float, float, float, float],
+    least: int,
+    out: Any,
+) -> None:
+    """Fit every cap; see `fit_caps`. A cap without a fit keeps the count 0."""
+    caps, covariances, surfaces, counts = out
+    far = rank_by_depth(image[0], circles, image[3])
+    points, edges = np.empty((len(CELLS), 5)), np.empty((DIRECTIONS, 3))
+    outline, ray = np.empty((ROUND, 3)), np.empty(3)
+    for i in range(len(circles)):
+        n, m, middle = gather(i, image, circles, far, focal, sensor, (points, edges, outline))
+        if n < least or middle <= 0.0:
+            continue
+        data = (points[:n], edges[:m], outline)
+        size = circles[i, 2] * middle / focal
+        ray_at(image[2], focal, circles[i, 0], circles[i, 1], ray)
+        start(caps[i], up, ray, middle, size)
+        if not refine(caps[i], data, up, noise, focal, size, 0, 4):
+            continue
+        weight = uncertainty(caps[i], data, up, noise, focal, covariances[i])
+        if weight < 0.0:
+            continue
+        locate(caps[i], ray, covariances[i], noise.circle_px / focal, surfaces[i])
+        counts[i, 0], counts[i, 1], counts[i, 2] = n, m, weight
+
+
+@jit
+def locate(cap: Floats, ray: Floats, covariance: Floats, sigma: float, out: Floats) -> None:
+    """Fill the point (3,) where a ray meets a cap, and its sigmas (3,), m.
+
+    Args:
+        cap: (14,) the cap.
+        ray: (3,) unit.
+        covariance: (7, 7) of the cap.
+        sigma: Of the ray's direction, rad.
+        out: (6,) out.
+    """
+    row = np.empty(UNKNOWNS)
+    t, k, _ = meet(cap, ray, False)
+    _, _, cosine = slope(cap, ray, t, k, row)
+    variance = 0.0
+    for i in range(UNKNOWNS):
+        for j in range(UNKNOWNS):
+            variance += row[i] * covariance[i, j] * row[j]
+    cosine = max(cosine, 0.1)
+    along = variance / (cosine * cosine)
+    across = (sigma * t) ** 2
+    # an error across the ray moves the point up or down the slope
+    along += across * (1.0 - cosine * cosine) / (cosine * cosine)
+    for i in range(3):
+        share = ray[i] * ray[i]
+        out[i] = t * ray[i]
+        out[3 + i] = np.sqrt(along * share + across * (1.0 - share))
+
+
+def fit_caps(
+    depth: NDArray[Any],
+    scale: float,
+    bias: float,
+    rays: NDArray[np.float32],
+    circles: Floats,
+    focal: float,
+    up: Floats,
+    noise: Noise,
+    sensor: tuple[float, float],
+    edge_offset: float,
+    least: int,
+) -> Fits:
+    """Fit a cap to the depth in each circle.
+
+    Args:
+        depth: (H, W) native, 0 = missing, finite.
+        scale: Metres per unit.
+        bias: Taken off the depth, m.
+        rays: (H, W, 2) float32 rays at z = 1.
+        circles: (N, 3) x, y, radius, px.
+        focal: Focal length, px.
+        up: (3,) unit, the upright.
+        noise: Standard deviations of the model.
+        sensor: Sigma of depth is sensor[0] + sensor[1] z, m.
+        edge_offset: How much of an edge the sensor loses, px.
+        least: Fewest points that make a fit.
+    """
+    n = len(circles)
+    caps, covariances = np.full((n, SIZE), np.nan), np.full((n, UNKNOWNS, UNKNOWNS), np.nan)
+    surfaces, counts = np.full((n, 6), np.nan), np.zeros((n, 3))
+    labels = np.zeros(depth.shape, np.int32)
+    fit_all(
+        (depth, scale, rays, labels),
+        circles,
+        focal,
+        up,
+        noise,
+        (*sensor, bias, edge_offset),
+        least,
+        (caps, covariances, surfaces, counts),
+    )
+    return _fits(caps, covariances, surfaces, counts)
+
+
+def _fits(caps: Floats, covariances: Floats, surfaces: Floats, counts: Floats) -> Fits:
+    finite = np.isfinite(caps).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
+    valid = (counts[:, 0] > 0) & finite & np.isfinite(surfaces).all(axis=1)
+    for array in (caps, covariances, surfaces):
+        array[~valid] = np.nan
+    diagonal = np.diagonal(covariances, axis1=1, axis2=2)
+    center, axis = caps[:, :3], caps[:, N : N + 3]
+    return Fits(
+        valid,
+        center,
+        axis,
+        caps[:, RADIUS],
+        caps[:, HEIGHT],
+        center + caps[:, HEIGHT, None] * axis,
+        surfaces[:, :3],
+        covariances,
+        np.sqrt(diagonal[:, 3] + diagonal[:, 4]),
+        np.sqrt(diagonal[:, 5]),
+        surfaces[:, 3:],
+        np.where(valid, np.minimum(counts[:, 2] / len(CELLS), 1.0), np.nan),
+        counts[:, 1].astype(np.int64),
+    )

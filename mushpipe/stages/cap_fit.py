@@ -1,0 +1,152 @@
+"""Position, size and orientation of each cap at once, by fitting a spheroid to its depth."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, PrivateAttr
+
+from mushpipe import (
+    Camera,
+    Circles,
+    DepthSource,
+    InputError,
+    Locations,
+    Poses,
+    RgbdFrame,
+    Stage,
+    quaternion_from_axis,
+)
+from mushpipe.stages.cap_batch import Fits, fit_caps
+from mushpipe.stages.cap_solve import Noise
+from mushpipe.stages.upright import bed_normal
+
+Floats = NDArray[np.float64]
+
+
+class CapFit(Stage):
+    """Fits a spheroid cap to the depth in each circle: axis, apex, diameter, with sigmas.
+
+    Seven parameters are fitted to block means of the depth, along their rays; to the depth edge and
+    the circle, which touch the cap; and to what caps are like. Nearer mushrooms' circles hide what
+    they cover. Where tilt cannot be seen the sigma says so. A mushroom with hardly any depth is
+    ``missing`` and has no pose.
+    """
+
+    up: Literal["bed", "camera"] | tuple[float, float, float] = Field(
+        "bed",
+        description="the upright: the bed's normal, towards the camera, or a vector in its frame",
+    )
+    tilt_deg: float = Field(
+        25, gt=0, le=90, description="spread of the tilt off the upright, degrees"
+    )
+    depth_bias_mm: float = Field(
+        0, ge=-20, le=20, description="taken off the depth; 2.85 for the SR300 of the paper"
+    )
+    depth_noise_mm: float = Field(0.3, ge=0, description="sigma of depth at the camera, mm")
+    depth_noise_per_m: float = Field(1.2, ge=0, description="its growth with depth, mm per m")
+    edge_offset_px: float = Field(
+        0.45, ge=-3, le=3, description="how much of a cap's edge the depth camera loses, px"
+    )
+    circle_sigma_px: float = Field(2, gt=0, description="sigma of the circles, px")
+    min_points: int = Field(8, ge=6, le=97, description="fewest of 97 points a fit needs")
+
+    _rays: tuple[Camera, NDArray[np.float32]] | None = PrivateAttr(None)
+
+    def open(self) -> None:
+        """Compile the kernels."""
+        camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+        circles = Circles(np.array([[32.0, 24.0]]), np.array([9.0]), np.ones(1))
+        for depth in (np.full((48, 64), 400, np.uint16), np.full((48, 64), 0.4, np.float32)):
+            self._fit(depth, 0.001, camera, circles)
+
+    def process(self, frame: RgbdFrame, circles: Circles) -> tuple[Locations, Poses]:
+        """Return one location and one pose per circle.
+
+        Raises:
+            InputError: The frame has depth but no calibration.
+        """
+        if frame.depth is None or not len(circles):
+            return _unknown(len(circles))
+        if frame.camera is None:
+            raise InputError(
+                "depth cannot be turned into metres without the camera's calibration: record "
+                "camera_info, or set source.camera: {fx: , fy: , cx: , cy: }"
+            )
+        depth = frame.depth
+        if depth.dtype == np.float32:
+            depth = np.nan_to_num(depth, posinf=0.0, neginf=0.0)
+        fits = self._fit(depth, frame.depth_scale, frame.camera, circles)
+        return _locations(fits, circles, depth), _poses(fits)
+
+    def _fit(self, depth: NDArray[Any], scale: float, camera: Camera, circles: Circles) -> Fits:
+        rays = self._rays_of(camera)
+        noise = Noise(
+            0.0006, 0.02, self.circle_sigma_px, 2.0, 0.6, 0.15, float(np.radians(self.tilt_deg))
+        )
+        disc = np.column_stack([circles.center, circles.radius])
+        return fit_caps(
+            depth,
+            scale,
+            self.depth_bias_mm / 1000,
+            rays,
+            disc,
+            (camera.fx + camera.fy) / 2,
+            self._upright(depth, scale, rays),
+            noise,
+            (self.depth_noise_mm / 1000, self.depth_noise_per_m / 1000),
+            self.edge_offset_px,
+            self.min_points,
+        )
+
+    def _rays_of(self, camera: Camera) -> NDArray[np.float32]:
+        """Return the rays (H, W, 2) at z = 1; far beyond any image where the lens has none."""
+        if self._rays is None or self._rays[0] != camera:
+            v, u = np.mgrid[: camera.height, : camera.width]
+            points = camera.deproject(np.stack([u, v], axis=-1), np.ones(u.shape))[..., :2]
+            self._rays = camera, np.nan_to_num(points, nan=1e6).astype(np.float32)
+        return self._rays[1]
+
+    def _upright(self, depth: NDArray[Any], scale: float, rays: NDArray[np.float32]) -> Floats:
+        if isinstance(self.up, tuple):
+            vector = np.array(self.up)
+            return np.asarray(vector / np.linalg.norm(vector))
+        normal = bed_normal(depth, scale, rays) if self.up == "bed" else None
+        return np.array([0.0, 0.0, -1.0]) if normal is None else normal
+
+
+def _locations(fits: Fits, circles: Circles, depth: NDArray[Any]) -> Locations:
+    u, v = np.rint(circles.center).astype(int).T
+    height, width = depth.shape
+    inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    measured = inside & (depth[v.clip(0, height - 1), u.clip(0, width - 1)] > 0)
+    source = np.where(measured, DepthSource.MEASURED, DepthSource.NEIGHBOURS)
+    return Locations(
+        position=fits.surface,
+        distance=np.linalg.norm(fits.surface, axis=1),
+        diameter=2 * fits.radius,
+        source=np.where(fits.valid, source, DepthSource.MISSING).astype(np.uint8),
+        sigma_position=fits.sigma_surface,
+        sigma_diameter=2 * fits.sigma_radius,
+    )
+
+
+def _poses(fits: Fits) -> Poses:
+    return Poses(
+        quaternion=quaternion_from_axis(fits.axis),
+        axis=fits.axis,
+        apex=fits.apex,
+        sigma_rad=fits.sigma_tilt,
+        fitness=fits.fitness,
+        valid=fits.valid,
+    )
+
+
+def _unknown(n: int) -> tuple[Locations, Poses]:
+    nan = np.full((n, 4), np.nan)
+    three, one = nan[:, :3], nan[:, 0]
+    missing = np.full(n, DepthSource.MISSING, np.uint8)
+    locations = Locations(three, one, one, missing, three, one)
+    return locations, Poses(nan, three, three, one, one, np.zeros(n, bool))
