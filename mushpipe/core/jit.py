@@ -13,6 +13,6 @@ F = TypeVar("F", bound=Callable[..., Any])
 def jit(function: F) -> F:
     """Compile a kernel on first use; on a machine without a writable cache, in every process."""
     try:
-        return cast(F, njit(cache=True, nogil=True, fastmath=True)(function))
+        return cast(F, njit(cache=True, nogil=True, fastmath=True, error_model="numpy")(function))
     except RuntimeError:  # numba found no folder it may write to
-        return cast(F, njit(nogil=True, fastmath=True)(function))
+        return cast(F, njit(nogil=True, fastmath=True, error_model="numpy")(function))

@@ -9,7 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
-from mushpipe.stages.cap_model import HEIGHT, N, RADIUS, SIZE, UNKNOWNS, Floats, meet, slope
+from mushpipe.stages.cap_model import (
+    HEIGHT,
+    RADIUS,
+    SIZE,
+    UNKNOWNS,
+    Floats,
+    N,
+    Vector,
+    frozen,
+    meet,
+    slope,
+)
 from mushpipe.stages.cap_samples import (
     CELLS,
     COMPASS,
@@ -19,7 +30,7 @@ from mushpipe.stages.cap_samples import (
     sample_depth,
     sample_edges,
 )
-from mushpipe.stages.cap_solve import ROUND, Noise, refine, start, uncertainty
+from mushpipe.stages.cap_solve import ROUND, Noise, refine, start, uncertainty, workspace
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +75,8 @@ def core_depth(depth: NDArray[Any], circle: Floats) -> float:
     n = 0
     for i in range(-4, 5):
         for j in range(-4, 5):
-            u = int(np.round(circle[0] + 0.12 * i * circle[2]))
-            v = int(np.round(circle[1] + 0.12 * j * circle[2]))
+            u = int(np.floor(circle[0] + 0.12 * i * circle[2] + 0.5))
+            v = int(np.floor(circle[1] + 0.12 * j * circle[2] + 0.5))
             if 0 <= v < depth.shape[0] and 0 <= u < depth.shape[1] and depth[v, u] > 0:
                 values[n] = depth[v, u]
                 n += 1
@@ -73,43 +84,44 @@ def core_depth(depth: NDArray[Any], circle: Floats) -> float:
 
 
 @jit
-def rank_by_depth(depth: NDArray[Any], circles: Floats, labels: NDArray[np.int32]) -> Floats:
-    """Paint all circles, the nearest last, and return their core depths (N,), native."""
+def rank_by_depth(
+    depth: NDArray[Any], circles: Floats, ranks: NDArray[np.int32]
+) -> NDArray[np.int64]:
+    """Return each circle's rank (N,), the nearest 0, and paint them over a `ranks` full of N."""
     far = np.empty(len(circles))
     for i in range(len(circles)):
         far[i] = core_depth(depth, circles[i])
-    paint(labels, circles, np.argsort(-far)[: len(far)])
-    return far
+        if far[i] <= 0.0:
+            far[i] = 1e30  # hides nothing
+    order = np.argsort(far)
+    paint(ranks, circles, order)
+    rank = np.empty(len(circles), np.int64)
+    for k in range(len(circles)):
+        rank[order[k]] = k
+    return rank
 
 
 @jit
 def gather(
-    i: int,
     image: Any,
-    circles: Floats,
-    far: Floats,
+    circle: Floats,
+    rank: int,
     focal: float,
     sensor: tuple[float, float, float, float],
     data: Any,
 ) -> tuple[int, int, float]:
-    """Take the data of cap i; return numbers of points and edge rays, and the middle depth (m)."""
-    depth, scale, rays, labels = image
+    """Take the data of a cap; return numbers of points and edge rays, and its middle depth (m)."""
     points, edges, outline = data
-    hides = np.zeros(len(circles) + 1, np.bool_)
-    for k in range(len(circles)):
-        hides[k + 1] = k != i and 0.0 < far[k] < far[i]
-    noise = (sensor[0], sensor[1])
-    circle = circles[i]
-    n, middle = sample_depth(depth, scale, rays, labels, hides, circle, focal, noise, points)
+    n, middle = sample_depth(image, rank, circle, focal, (sensor[0], sensor[1]), points)
     if n == 0:
         return 0, 0, 0.0
-    m = sample_edges(depth, scale, rays, labels, hides, circle, focal, middle, sensor[3], edges)
+    m = sample_edges(image, rank, circle, focal, middle, sensor[3], edges)
     for j in range(n):
-        points[j, 3] -= sensor[2] / points[j, 2]
+        points[3, j] -= sensor[2] / points[2, j]
     for j in range(ROUND):
         turn = COMPASS[j * (DIRECTIONS // ROUND)]
         x, y = circle[0] + circle[2] * turn[0], circle[1] + circle[2] * turn[1]
-        ray_at(rays, focal, x, y, outline[j])
+        outline[0, j], outline[1, j], outline[2, j] = ray_at(image[2], focal, x, y)
     return n, m, middle - sensor[2]
 
 
@@ -126,20 +138,21 @@ def fit_all(
 ) -> None:
     """Fit every cap; see `fit_caps`. A cap without a fit keeps the count 0."""
     caps, covariances, surfaces, counts = out
-    far = rank_by_depth(image[0], circles, image[3])
-    points, edges = np.empty((len(CELLS), 5)), np.empty((DIRECTIONS, 3))
-    outline, ray = np.empty((ROUND, 3)), np.empty(3)
+    rank = rank_by_depth(image[0], circles, image[3])
+    points, edges = np.empty((5, len(CELLS))), np.empty((3, DIRECTIONS))
+    outline, work = np.empty((3, ROUND)), workspace()
     for i in range(len(circles)):
-        n, m, middle = gather(i, image, circles, far, focal, sensor, (points, edges, outline))
+        data = (points, edges, outline)
+        n, m, middle = gather(image, circles[i], rank[i], focal, sensor, data)
         if n < least or middle <= 0.0:
             continue
-        data = (points[:n], edges[:m], outline)
+        data = (points[:, :n], edges[:, :m], outline)
         size = circles[i, 2] * middle / focal
-        ray_at(image[2], focal, circles[i, 0], circles[i, 1], ray)
+        ray = ray_at(image[2], focal, circles[i, 0], circles[i, 1])
         start(caps[i], up, ray, middle, size)
-        if not refine(caps[i], data, up, noise, focal, size, 0, 4):
+        if not refine(caps[i], data, up, noise, focal, size, (0, 4), work):
             continue
-        weight = uncertainty(caps[i], data, up, noise, focal, covariances[i])
+        weight = uncertainty(caps[i], data, up, noise, focal, covariances[i], work)
         if weight < 0.0:
             continue
         locate(caps[i], ray, covariances[i], noise.circle_px / focal, surfaces[i])
@@ -147,28 +160,27 @@ def fit_all(
 
 
 @jit
-def locate(cap: Floats, ray: Floats, covariance: Floats, sigma: float, out: Floats) -> None:
+def locate(cap: Floats, ray: Vector, covariance: Floats, sigma: float, out: Floats) -> None:
     """Fill the point (3,) where a ray meets a cap, and its sigmas (3,), m.
 
     Args:
         cap: (14,) the cap.
-        ray: (3,) unit.
+        ray: Unit vector.
         covariance: (7, 7) of the cap.
         sigma: Of the ray's direction, rad.
         out: (6,) out.
     """
-    row = np.empty(UNKNOWNS)
-    t, k, _ = meet(cap, ray, False)
-    _, _, cosine = slope(cap, ray, t, k, row)
+    c = frozen(cap)
+    t, k, _ = meet(c, ray, False)
+    row = np.array(slope(c, ray, t, k))
     variance = 0.0
     for i in range(UNKNOWNS):
         for j in range(UNKNOWNS):
-            variance += row[i] * covariance[i, j] * row[j]
-    cosine = max(cosine, 0.1)
-    along = variance / (cosine * cosine)
+            variance += row[3 + i] * covariance[i, j] * row[3 + j]
+    square = max(row[2], 0.1) ** 2  # of the cosine of incidence
     across = (sigma * t) ** 2
     # an error across the ray moves the point up or down the slope
-    along += across * (1.0 - cosine * cosine) / (cosine * cosine)
+    along = (variance + across * (1.0 - square)) / square
     for i in range(3):
         share = ray[i] * ray[i]
         out[i] = t * ray[i]
@@ -206,9 +218,9 @@ def fit_caps(
     n = len(circles)
     caps, covariances = np.full((n, SIZE), np.nan), np.full((n, UNKNOWNS, UNKNOWNS), np.nan)
     surfaces, counts = np.full((n, 6), np.nan), np.zeros((n, 3))
-    labels = np.zeros(depth.shape, np.int32)
+    ranks = np.full(depth.shape, n, np.int32)
     fit_all(
-        (depth, scale, rays, labels),
+        (depth, scale, rays, ranks),
         circles,
         focal,
         up,

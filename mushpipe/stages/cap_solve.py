@@ -5,25 +5,26 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
 from mushpipe.stages.cap_model import (
+    E1,
     HEIGHT,
-    N,
     RADIUS,
     UNKNOWNS,
     Floats,
-    depth_residual,
+    N,
+    depth_rows,
     move,
     span,
-    tangent_residual,
+    tangent_rows,
 )
-from mushpipe.stages.cap_samples import GRID
+from mushpipe.stages.cap_samples import CELLS, GRID
 
 ROUND = 16  # rays around the detected circle
+ROOM = max(len(CELLS), 2 * ROUND)
 _TURN = np.arange(ROUND) * (2 * np.pi / ROUND)
-WAVES: Floats = np.stack([np.full(ROUND, 1.0), np.cos(_TURN), np.sin(_TURN)], axis=-1) / ROUND
+WAVES: Floats = np.stack([np.ones(ROUND), np.cos(_TURN), np.sin(_TURN)]) / ROUND
 # Noise is correlated between pixels; this share of the points counts.
 EFFECTIVE = 0.35 * 169 / GRID**2
 EDGE_WEIGHT = 0.6
@@ -54,13 +55,32 @@ class Noise(NamedTuple):
 
 
 @jit
-def add(normal: Floats, gradient: Floats, row: Floats, residual: float, weight: float) -> None:
-    """Add one residual to the lower triangle of the normal matrix and to the gradient."""
+def add(system: Any, rows: Floats, count: int) -> None:
+    """Add `count` columns of rows (8, M), derivatives and residual, already times root weight.
+
+    The lower triangle of the normal matrix and the gradient grow by their products.
+    """
+    normal, gradient = system
     for i in range(UNKNOWNS):
-        scaled = weight * row[i]
-        gradient[i] += scaled * residual
         for j in range(i + 1):
-            normal[i, j] += scaled * row[j]
+            total = 0.0
+            for k in range(count):
+                total += rows[i, k] * rows[j, k]
+            normal[i, j] += total
+        total = 0.0
+        for k in range(count):
+            total += rows[i, k] * rows[UNKNOWNS, k]
+        gradient[i] += total
+
+
+@jit
+def scale(rows: Floats, weights: Floats, count: int) -> None:
+    """Multiply `count` columns of rows (8, M) by the roots of their weights (M,)."""
+    for k in range(count):
+        weights[k] = np.sqrt(weights[k])
+    for i in range(UNKNOWNS + 1):
+        for k in range(count):
+            rows[i, k] *= weights[k]
 
 
 @jit
@@ -97,84 +117,89 @@ def substitute(factor: Floats, vector: Floats) -> None:
 @jit
 def tukey(squared: float, cut: float) -> float:
     """Return Tukey's weight of a squared, normalised residual."""
-    return (1.0 - squared / cut) ** 2 if squared < cut else 0.0
+    rest = max(1.0 - squared / cut, 0.0)
+    return rest * rest
 
 
 @jit
 def add_depth(
-    cap: Floats, points: Floats, noise: Any, focal: float, cut: float, system: Any
+    cap: Floats, points: Floats, noise: Any, focal: float, cut: float, work: Any
 ) -> float:
-    """Add the points (M, 5) of a cap; return the sum of their robust weights."""
-    normal, gradient, row = system
+    """Add the points (5, M) of a cap; return the sum of their robust weights."""
+    system, rows, weights = work
+    count = points.shape[1]
+    depth_rows(cap, points, count, rows)
     total = 0.0
-    for j in range(len(points)):
-        ray, far, sigma = points[j, :3], points[j, 3], points[j, 4]
-        residual, cosine = depth_residual(cap, ray, far, row)
-        variance = noise.shape**2 + (sigma * cosine) ** 2
-        if cosine == 0.0:
-            variance += (0.7 * far / focal) ** 2
+    for j in range(count):
+        cosine, residual = rows[8, j], rows[7, j]
+        missed = 0.0 if cosine > 0.0 else 0.7 * points[3, j] / focal
+        variance = noise.shape**2 + (points[4, j] * cosine) ** 2 + missed**2
         weight = tukey(residual * residual / variance, cut)
         total += weight
-        if weight > 0.0:
-            add(normal, gradient, row, residual, EFFECTIVE * weight / variance)
+        weights[j] = EFFECTIVE * weight / variance
+    scale(rows, weights, count)
+    add(system, rows, count)
     return total
 
 
 @jit
-def add_edges(
-    cap: Floats, edges: Floats, noise: Any, pixel: float, cut: float, system: Any
-) -> None:
-    """Add the rays (M, 3) along the depth edge: each touches the cap."""
-    normal, gradient, row = system
+def add_edges(cap: Floats, edges: Floats, noise: Any, pixel: float, cut: float, work: Any) -> None:
+    """Add the rays (3, M) along the depth edge: each touches the cap."""
+    system, rows, weights = work
+    count = edges.shape[1]
+    tangent_rows(cap, edges, count, rows)
     variance = (noise.edge_px * pixel) ** 2 + (noise.outline * cap[RADIUS]) ** 2
-    for j in range(len(edges)):
-        residual = tangent_residual(cap, edges[j], row)
-        weight = EDGE_WEIGHT * tukey(residual * residual / variance, cut)
-        if weight > 0.0:
-            add(normal, gradient, row, residual, weight / variance)
+    for j in range(count):
+        weights[j] = EDGE_WEIGHT * tukey(rows[7, j] * rows[7, j] / variance, cut) / variance
+    scale(rows, weights, count)
+    add(system, rows, count)
 
 
 @jit
-def add_circle(cap: Floats, outline: Floats, noise: Any, pixel: float, system: Any) -> None:
+def add_circle(cap: Floats, outline: Floats, noise: Any, pixel: float, work: Any) -> None:
     """Add the detected circle's three numbers: mean, cosine and sine of its distance to the cap.
 
-    The rays (ROUND, 3) around the circle touch the cap on average; single ones need not, for the
+    The rays (3, ROUND) around the circle touch the cap on average; single ones need not, for the
     outline of a cap is no circle.
     """
-    normal, gradient, row = system
-    value = np.zeros(3)
-    rows = np.zeros((3, UNKNOWNS))
-    for j in range(ROUND):
-        residual = tangent_residual(cap, outline[j], row)
+    system, rows, weights = work
+    tangent_rows(cap, outline, ROUND, rows)
+    for i in range(UNKNOWNS + 1):
         for w in range(3):
-            value[w] += WAVES[j, w] * residual
-            for i in range(UNKNOWNS):
-                rows[w, i] += WAVES[j, w] * row[i]
-    size = (noise.circle_px * pixel) ** 2 + (noise.outline * cap[RADIUS]) ** 2
-    for w in range(3):
-        # the mean of cos^2 is a half: a shift by d shows as d/2 in the cosine
-        add(normal, gradient, rows[w], value[w], (1.0 if w == 0 else 4.0) / size)
+            total = 0.0
+            for j in range(ROUND):
+                total += WAVES[w, j] * rows[i, j]
+            rows[i, ROUND + w] = total
+    for i in range(UNKNOWNS + 1):
+        for w in range(3):
+            rows[i, w] = rows[i, ROUND + w]
+    variance = (noise.circle_px * pixel) ** 2 + (noise.outline * cap[RADIUS]) ** 2
+    weights[0] = 1.0 / variance
+    # the mean of cos^2 is a half: a shift by d shows as d/2 in the cosine
+    weights[1] = weights[2] = 4.0 / variance
+    scale(rows, weights, 3)
+    add(system, rows, 3)
 
 
 @jit
-def add_priors(cap: Floats, up: Floats, noise: Any, system: Any) -> None:
+def add_priors(cap: Floats, up: Floats, noise: Any, work: Any) -> None:
     """Add what is known of any cap: its aspect, and that it grows upwards, more or less."""
-    normal, gradient, row = system
-    row[:] = 0.0
-    row[5], row[6] = -noise.aspect, 1.0
-    spread = (noise.aspect_sigma * cap[RADIUS]) ** 2
-    add(normal, gradient, row, cap[HEIGHT] - noise.aspect * cap[RADIUS], 1.0 / spread)
-    # off = up - n (n.up): sine of the tilt, towards the upright; its length becomes the angle
+    system, rows, weights = work
+    rows[: UNKNOWNS + 1, :3] = 0.0
+    rows[5, 0], rows[6, 0] = -noise.aspect, 1.0
+    rows[7, 0] = cap[HEIGHT] - noise.aspect * cap[RADIUS]
+    weights[0] = 1.0 / (noise.aspect_sigma * cap[RADIUS]) ** 2
+    # the turn that takes n to the upright: its direction across n, as long as the angle
     cosine = min(max(cap[N] * up[0] + cap[N + 1] * up[1] + cap[N + 2] * up[2], -1.0), 1.0)
-    sine = np.sqrt(max(1.0 - cosine * cosine, 1e-18))
-    stretch = np.arccos(cosine) / sine
-    for direction in range(2):
-        row[:] = 0.0
-        row[3 + direction] = 1.0
-        off = 0.0
-        for i in range(3):
-            off -= up[i] * cap[8 + 3 * direction + i]
-        add(normal, gradient, row, off * stretch, 1.0 / noise.tilt**2)
+    stretch = np.arccos(cosine) / np.sqrt(max(1.0 - cosine * cosine, 1e-18))
+    for w in range(2):
+        e = E1 + 3 * w
+        rows[3 + w, 1 + w] = 1.0
+        off = cap[e] * up[0] + cap[e + 1] * up[1] + cap[e + 2] * up[2]
+        rows[7, 1 + w] = -off * stretch
+        weights[1 + w] = 1.0 / noise.tilt**2
+    scale(rows, weights, 3)
+    add(system, rows, 3)
 
 
 @jit
@@ -206,6 +231,13 @@ def start(cap: Floats, up: Floats, ray: Floats, middle: float, size: float) -> N
 
 
 @jit
+def workspace() -> Any:
+    """Return normal matrix (7, 7) and gradient (7,), and room for rows and weights."""
+    system = (np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS))
+    return system, np.empty((UNKNOWNS + 2, ROOM)), np.empty(ROOM)
+
+
+@jit
 def build(
     cap: Floats,
     data: tuple[Floats, Floats, Floats],
@@ -213,27 +245,27 @@ def build(
     noise: Any,
     focal: float,
     cuts: tuple[float, float],
-    system: Any,
+    work: Any,
 ) -> float:
     """Fill the normal equations of a cap; return the sum of the weights of its points.
 
     Args:
         cap: (14,) the estimate.
-        data: Points (M, 5), edge rays (E, 3) and rays around the circle (ROUND, 3).
+        data: Points (5, M), edge rays (3, E) and rays around the circle (3, ROUND).
         up: (3,) unit, the upright.
         noise: `Noise`.
         focal: Focal length, px.
         cuts: Squared residuals, of points and edges, beyond which one has no weight.
-        system: Normal matrix (7, 7), gradient (7,) and a row (7,) to work with.
+        work: From `workspace`.
     """
     points, edges, outline = data
-    system[0][:] = 0.0
-    system[1][:] = 0.0
+    work[0][0][:] = 0.0
+    work[0][1][:] = 0.0
     pixel = cap[2] / focal
-    total = add_depth(cap, points, noise, focal, cuts[0], system)
-    add_edges(cap, edges, noise, pixel, cuts[1], system)
-    add_circle(cap, outline, noise, pixel, system)
-    add_priors(cap, up, noise, system)
+    total = add_depth(cap, points, noise, focal, cuts[0], work)
+    add_edges(cap, edges, noise, pixel, cuts[1], work)
+    add_circle(cap, outline, noise, pixel, work)
+    add_priors(cap, up, noise, work)
     return total
 
 
@@ -245,20 +277,21 @@ def refine(
     noise: Any,
     focal: float,
     size: float,
-    first: int,
-    last: int,
+    steps: tuple[int, int],
+    work: Any,
 ) -> bool:
-    """Take Gauss-Newton steps number first to last - 1; False where one has no solution."""
-    system = (np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS), np.empty(UNKNOWNS))
-    for k in range(first, last):
+    """Take Gauss-Newton steps number steps[0] to steps[1] - 1; False where one has no solution."""
+    normal, gradient = work[0]
+    for k in range(steps[0], steps[1]):
         m = min(k, len(DEPTH_CUTS) - 1)
-        build(cap, data, up, noise, focal, (DEPTH_CUTS[m], EDGE_CUTS[m]), system)
-        if not cholesky(system[0]):
+        build(cap, data, up, noise, focal, (DEPTH_CUTS[m], EDGE_CUTS[m]), work)
+        if not cholesky(normal):
             return False
-        step = -system[1]
-        substitute(system[0], step)
-        limit(cap, step, size)
-        move(cap, step)
+        substitute(normal, gradient)
+        for i in range(UNKNOWNS):
+            gradient[i] = -gradient[i]
+        limit(cap, gradient, size)
+        move(cap, gradient)
     return True
 
 
@@ -270,15 +303,14 @@ def uncertainty(
     noise: Any,
     focal: float,
     covariance: Floats,
+    work: Any,
 ) -> float:
     """Fill the covariance (7, 7) at the solution; return the weight of the points, -1 if none."""
-    system = (covariance, np.empty(UNKNOWNS), np.empty(UNKNOWNS))
-    total = build(cap, data, up, noise, focal, (DEPTH_CUTS[-1], EDGE_CUTS[-1]), system)
-    factor = covariance.copy()
-    if not cholesky(factor):
+    total = build(cap, data, up, noise, focal, (DEPTH_CUTS[-1], EDGE_CUTS[-1]), work)
+    if not cholesky(work[0][0]):
         return -1.0
     for i in range(UNKNOWNS):
         covariance[i, :] = 0.0
         covariance[i, i] = 1.0
-        substitute(factor, covariance[i])
+        substitute(work[0][0], covariance[i])
     return total
