@@ -45,7 +45,7 @@ class Fits:
         height: (N,) m, of the dome.
         apex: (N, 3) m.
         surface: (N, 3) m, where the ray of the circle's centre meets the cap.
-        covariance: (N, 7, 7) of centre, two turns of the axis, radius, height.
+        covariance: (N, 8, 8) of centre, two turns of the axis, radius, height, bulge.
         sigma_tilt: (N,) rad.
         sigma_radius: (N,) m.
         sigma_surface: (N, 3) m.
@@ -164,9 +164,9 @@ def locate(cap: Floats, ray: Vector, covariance: Floats, sigma: float, out: Floa
     """Fill the point (3,) where a ray meets a cap, and its sigmas (3,), m.
 
     Args:
-        cap: (14,) the cap.
+        cap: (15,) the cap.
         ray: Unit vector.
-        covariance: (7, 7) of the cap.
+        covariance: (8, 8) of the cap.
         sigma: Of the ray's direction, rad.
         out: (6,) out.
     """
@@ -178,12 +178,13 @@ def locate(cap: Floats, ray: Vector, covariance: Floats, sigma: float, out: Floa
         for j in range(UNKNOWNS):
             variance += row[3 + i] * covariance[i, j] * row[3 + j]
     square = max(row[2], 0.1) ** 2  # of the cosine of incidence
+    far = t + row[0] / (row[1] * max(row[2], 0.3))  # a step to the surface with its bulge
     across = (sigma * t) ** 2
     # an error across the ray moves the point up or down the slope
     along = (variance + across * (1.0 - square)) / square
     for i in range(3):
         share = ray[i] * ray[i]
-        out[i] = t * ray[i]
+        out[i] = far * ray[i]
         out[3 + i] = np.sqrt(along * share + across * (1.0 - share))
 
 

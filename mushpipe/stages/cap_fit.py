@@ -84,7 +84,15 @@ class CapFit(Stage):
     def _fit(self, depth: NDArray[Any], scale: float, camera: Camera, circles: Circles) -> Fits:
         rays = self._rays_of(camera)
         noise = Noise(
-            0.0006, 0.02, self.circle_sigma_px, 2.0, 0.6, 0.15, float(np.radians(self.tilt_deg))
+            0.0006,
+            0.02,
+            self.circle_sigma_px,
+            2.0,
+            0.6,
+            0.15,
+            0.0,
+            0.06,
+            float(np.radians(self.tilt_deg)),
         )
         disc = np.column_stack([circles.center, circles.radius])
         return fit_caps(

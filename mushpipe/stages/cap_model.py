@@ -1,10 +1,14 @@
-"""The cap as two halves of spheroids, and how a ray of sight meets it.
+"""The cap as two halves of spheroids with a bulge, and how a ray of sight meets it.
 
-A cap is seven numbers: the centre C of its rim plane, its unit axis n (two degrees of freedom), the
-radius R of the rim and the height h of the dome. With s = (p - C).n and rho^2 = |p - C|^2 - s^2 its
-surface is F = 1, F^2 = rho^2/R^2 + s^2/k^2, where k = h above the rim plane (the dome) and
-k = LIP R below it (the margin that rolls in). A cap is held in an array of 14: C, n, R, h, and two
-unit vectors e1, e2 that span the plane across n. Lengths are metres, in the camera's optical frame.
+A cap is eight numbers: the centre C of its rim plane, its unit axis n (two degrees of freedom), the
+radius R of the rim, the height h of the dome and the bulge b of its profile. With s = (p - C).n and
+rho^2 = |p - C|^2 - s^2, F^2 = rho^2/R^2 + s^2/k^2 where k = h above the rim plane (the dome) and
+k = LIP R below it (the margin that rolls in). The surface is F = 1 + b w, w = 4 x (1 - x) with
+x = s^2/(k F)^2 on the dome: b > 0 is a flat-topped cap, b < 0 a conical one; top and rim stay.
+To first order a superellipse of exponent 2 + d has b = 0.17 d.
+
+A cap is held in an array of 15: C, n, R, h, b, and two unit vectors e1, e2 that span the plane
+across n. Lengths are metres, in the camera's optical frame.
 
 Kernels assume finite numbers. They take a cap as a tuple and rays as scalars, and loop over columns
 of arrays (k, M), so that the compiler can work on several rays at once.
@@ -21,9 +25,9 @@ Floats = NDArray[np.float64]
 Cap = tuple[float, ...]
 Vector = tuple[float, float, float]
 LIP = 0.25  # depth of the margin below the rim plane, in rim radii
-SIZE = 14
-N, RADIUS, HEIGHT, E1, E2 = 3, 6, 7, 8, 11
-UNKNOWNS = 7  # C (3), turn along e1 and e2 (2), R, h
+SIZE = 15
+N, RADIUS, HEIGHT, BULGE, E1, E2 = 3, 6, 7, 8, 9, 12
+UNKNOWNS = 8  # C (3), turn along e1 and e2 (2), R, h, b
 
 
 @jit
@@ -39,7 +43,7 @@ def span(cap: Floats) -> None:
 
 @jit
 def move(cap: Floats, step: Floats) -> None:
-    """Add a step (7,) to a cap and renew its axis and span."""
+    """Add a step (8,) to a cap and renew its axis and span."""
     norm = 0.0
     for i in range(3):
         cap[i] += step[i]
@@ -49,15 +53,16 @@ def move(cap: Floats, step: Floats) -> None:
         cap[N + i] /= np.sqrt(norm)
     cap[RADIUS] += step[5]
     cap[HEIGHT] += step[6]
+    cap[BULGE] += step[7]
     span(cap)
 
 
 @jit
 def frozen(cap: Floats) -> Cap:
-    """Return the array (14,) as a tuple."""
+    """Return the array (15,) as a tuple."""
     return (
         cap[0], cap[1], cap[2], cap[3], cap[4], cap[5], cap[6],
-        cap[7], cap[8], cap[9], cap[10], cap[11], cap[12], cap[13],
+        cap[7], cap[8], cap[9], cap[10], cap[11], cap[12], cap[13], cap[14],
     )  # fmt: skip
 
 
@@ -69,7 +74,7 @@ def dot(a: Vector, b: Vector) -> float:
 
 @jit
 def enter(c: Cap, ray: Vector, k: float, tangent: bool) -> tuple[float, float, bool]:
-    """Return (t, s, hit) for one half of a cap, taken as a whole spheroid.
+    """Return (t, s, hit) for one half of a cap, taken as a whole spheroid without bulge.
 
     Solves A t^2 + 2 B t + G = F^2 - 1 = 0 for the point t ray.
 
@@ -107,38 +112,47 @@ def meet(c: Cap, ray: Vector, tangent: bool) -> tuple[float, float, bool]:
 
 @jit
 def slope(c: Cap, ray: Vector, t: float, k: float) -> tuple[float, ...]:
-    """Return how F changes at the point t ray in the half with half-axis k.
+    """Return P = F - 1 - b w at the point t ray, in the half with half-axis k, and how it changes.
 
     Returns:
-        F, |grad F| and |cos| of incidence; then the derivative of F by C, the two turns, R and h,
-        over |grad F|: that of the distance to the surface, positive where the surface recedes.
+        P, |grad P| and |cos| of incidence; then the derivative of P by C, the two turns, R, h and
+        b, over |grad P|: that of the distance to the surface, positive where it recedes.
     """
     q = (t * ray[0] - c[0], t * ray[1] - c[1], t * ray[2] - c[2])
     axis = (c[3], c[4], c[5])
     inverse = 1.0 / (c[RADIUS] * c[RADIUS])
     d = 1.0 / (k * k) - inverse
     s, square = dot(q, axis), dot(q, q)
+    dome = s > 0.0
     f = np.sqrt(max(square * inverse + d * s * s, 1e-12))
+    x = min(s * s / (k * k * f * f), 1.0) if dome else 0.0
+    # w depends on F and on s: dP = own dF + by_s ds
+    bend = 4.0 * c[BULGE] * (1.0 - 2.0 * x) if dome else 0.0
+    own = (1.0 + 2.0 * bend * x / f) / f
+    by_s = -2.0 * bend * s / (k * k * f * f)
+    lean = own * d * s + by_s
     g = (
-        (q[0] * inverse + d * s * axis[0]) / f,
-        (q[1] * inverse + d * s * axis[1]) / f,
-        (q[2] * inverse + d * s * axis[2]) / f,
+        own * q[0] * inverse + lean * axis[0],
+        own * q[1] * inverse + lean * axis[1],
+        own * q[2] * inverse + lean * axis[2],
     )
     length = np.sqrt(max(dot(g, g), 1e-12))
-    over = 1.0 / (length * f)
+    over = 1.0 / length
     by_radius = max(square - s * s, 0.0) * inverse / c[RADIUS]
     by_half = s * s / (k * k)  # k is h on the dome and LIP R on the margin
+    w = 4.0 * x * (1.0 - x)
     return (
-        f,
+        f - 1.0 - c[BULGE] * w,
         length,
-        abs(dot(g, ray)) / length,
-        -g[0] / length,
-        -g[1] / length,
-        -g[2] / length,
-        d * s * dot(q, (c[E1], c[E1 + 1], c[E1 + 2])) * over,
-        d * s * dot(q, (c[E2], c[E2 + 1], c[E2 + 2])) * over,
-        -(by_radius + (0.0 if s > 0.0 else by_half / c[RADIUS])) * over,
-        -(by_half / k if s > 0.0 else 0.0) * over,
+        abs(dot(g, ray)) * over,
+        -g[0] * over,
+        -g[1] * over,
+        -g[2] * over,
+        lean * dot(q, (c[E1], c[E1 + 1], c[E1 + 2])) * over,
+        lean * dot(q, (c[E2], c[E2 + 1], c[E2 + 2])) * over,
+        -own * (by_radius + (0.0 if dome else by_half / c[RADIUS])) * over,
+        (-own * by_half + 2.0 * bend * x) / k * over if dome else 0.0,
+        -w * over,
     )
 
 
@@ -151,20 +165,21 @@ def depth_rows(cap: Floats, points: Floats, count: int, rows: Floats) -> None:
     without that, points just outside the outline would not hold the radius.
 
     Args:
-        cap: (14,).
+        cap: (15,).
         points: (5, M): unit ray (3), range and its sigma, m.
         count: How many columns are points.
-        rows: (9, M) out: derivatives (7), the cosine held fixed; residual, m; cosine.
+        rows: (10, M) out: derivatives (8), the cosine held fixed; residual, m; cosine.
     """
     c = frozen(cap)
     for j in range(count):
         ray = (points[0, j], points[1, j], points[2, j])
         t, k, hit = meet(c, ray, False)
-        f, length, cosine, d0, d1, d2, d3, d4, d5, d6 = slope(c, ray, t, k)
-        rows[0, j], rows[1, j], rows[2, j] = d0, d1, d2
-        rows[3, j], rows[4, j], rows[5, j], rows[6, j] = d3, d4, d5, d6
-        rows[7, j] = cosine * (t - points[3, j]) if hit else (f - 1.0) / length
-        rows[8, j] = cosine if hit else 0.0
+        p, length, cosine, d0, d1, d2, d3, d4, d5, d6, d7 = slope(c, ray, t, k)
+        rows[0, j], rows[1, j], rows[2, j], rows[3, j] = d0, d1, d2, d3
+        rows[4, j], rows[5, j], rows[6, j], rows[7, j] = d4, d5, d6, d7
+        # one Newton step from the spheroid without bulge to the surface with it
+        rows[8, j] = p / length + (cosine * (t - points[3, j]) if hit else 0.0)
+        rows[9, j] = cosine if hit else 0.0
 
 
 @jit
@@ -177,7 +192,7 @@ def tangent_rows(cap: Floats, rays: Floats, count: int, rows: Floats) -> None:
     for j in range(count):
         ray = (rays[0, j], rays[1, j], rays[2, j])
         t, k, _ = meet(c, ray, True)
-        f, length, _, d0, d1, d2, d3, d4, d5, d6 = slope(c, ray, t, k)
-        rows[0, j], rows[1, j], rows[2, j] = d0, d1, d2
-        rows[3, j], rows[4, j], rows[5, j], rows[6, j] = d3, d4, d5, d6
-        rows[7, j] = (f - 1.0) / length
+        p, length, _, d0, d1, d2, d3, d4, d5, d6, d7 = slope(c, ray, t, k)
+        rows[0, j], rows[1, j], rows[2, j], rows[3, j] = d0, d1, d2, d3
+        rows[4, j], rows[5, j], rows[6, j], rows[7, j] = d4, d5, d6, d7
+        rows[8, j] = p / length

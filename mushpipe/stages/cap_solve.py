@@ -8,12 +8,14 @@ import numpy as np
 
 from mushpipe.core.jit import jit
 from mushpipe.stages.cap_model import (
+    BULGE,
     E1,
     HEIGHT,
     RADIUS,
     UNKNOWNS,
     Floats,
     N,
+    Vector,
     depth_rows,
     move,
     span,
@@ -28,6 +30,7 @@ WAVES: Floats = np.stack([np.ones(ROUND), np.cos(_TURN), np.sin(_TURN)]) / ROUND
 # Noise is correlated between pixels; this share of the points counts.
 EFFECTIVE = 0.35 * 169 / GRID**2
 EDGE_WEIGHT = 0.6
+BULGE_LIMIT = 0.15  # beyond, the profile is no longer convex
 DEPTH_CUTS = np.array([400.0, 81.0, 81.0, 16.0])
 EDGE_CUTS = np.array([25.0, 25.0, 9.0, 9.0])
 
@@ -42,6 +45,8 @@ class Noise(NamedTuple):
         edge_px: Of a depth edge, px.
         aspect: Middle aspect h/R of a cap.
         aspect_sigma: Its spread.
+        bulge: Middle bulge of a cap's profile.
+        bulge_sigma: Its spread.
         tilt: rad, spread of the tilt off the upright, per direction.
     """
 
@@ -51,12 +56,14 @@ class Noise(NamedTuple):
     edge_px: float
     aspect: float
     aspect_sigma: float
+    bulge: float
+    bulge_sigma: float
     tilt: float
 
 
 @jit
 def add(system: Any, rows: Floats, count: int) -> None:
-    """Add `count` columns of rows (8, M), derivatives and residual, already times root weight.
+    """Add `count` columns of rows (9, M), derivatives and residual, already times root weight.
 
     The lower triangle of the normal matrix and the gradient grow by their products.
     """
@@ -75,7 +82,7 @@ def add(system: Any, rows: Floats, count: int) -> None:
 
 @jit
 def scale(rows: Floats, weights: Floats, count: int) -> None:
-    """Multiply `count` columns of rows (8, M) by the roots of their weights (M,)."""
+    """Multiply `count` columns of rows (9, M) by the roots of their weights (M,)."""
     for k in range(count):
         weights[k] = np.sqrt(weights[k])
     for i in range(UNKNOWNS + 1):
@@ -131,7 +138,7 @@ def add_depth(
     depth_rows(cap, points, count, rows)
     total = 0.0
     for j in range(count):
-        cosine, residual = rows[8, j], rows[7, j]
+        cosine, residual = rows[UNKNOWNS + 1, j], rows[UNKNOWNS, j]
         missed = 0.0 if cosine > 0.0 else 0.7 * points[3, j] / focal
         variance = noise.shape**2 + (points[4, j] * cosine) ** 2 + missed**2
         weight = tukey(residual * residual / variance, cut)
@@ -150,7 +157,7 @@ def add_edges(cap: Floats, edges: Floats, noise: Any, pixel: float, cut: float, 
     tangent_rows(cap, edges, count, rows)
     variance = (noise.edge_px * pixel) ** 2 + (noise.outline * cap[RADIUS]) ** 2
     for j in range(count):
-        weights[j] = EDGE_WEIGHT * tukey(rows[7, j] * rows[7, j] / variance, cut) / variance
+        weights[j] = EDGE_WEIGHT * tukey(rows[UNKNOWNS, j] ** 2 / variance, cut) / variance
     scale(rows, weights, count)
     add(system, rows, count)
 
@@ -185,9 +192,9 @@ def add_circle(cap: Floats, outline: Floats, noise: Any, pixel: float, work: Any
 def add_priors(cap: Floats, up: Floats, noise: Any, work: Any) -> None:
     """Add what is known of any cap: its aspect, and that it grows upwards, more or less."""
     system, rows, weights = work
-    rows[: UNKNOWNS + 1, :3] = 0.0
+    rows[: UNKNOWNS + 1, :4] = 0.0
     rows[5, 0], rows[6, 0] = -noise.aspect, 1.0
-    rows[7, 0] = cap[HEIGHT] - noise.aspect * cap[RADIUS]
+    rows[UNKNOWNS, 0] = cap[HEIGHT] - noise.aspect * cap[RADIUS]
     weights[0] = 1.0 / (noise.aspect_sigma * cap[RADIUS]) ** 2
     # the turn that takes n to the upright: its direction across n, as long as the angle
     cosine = min(max(cap[N] * up[0] + cap[N + 1] * up[1] + cap[N + 2] * up[2], -1.0), 1.0)
@@ -196,10 +203,12 @@ def add_priors(cap: Floats, up: Floats, noise: Any, work: Any) -> None:
         e = E1 + 3 * w
         rows[3 + w, 1 + w] = 1.0
         off = cap[e] * up[0] + cap[e + 1] * up[1] + cap[e + 2] * up[2]
-        rows[7, 1 + w] = -off * stretch
+        rows[UNKNOWNS, 1 + w] = -off * stretch
         weights[1 + w] = 1.0 / noise.tilt**2
-    scale(rows, weights, 3)
-    add(system, rows, 3)
+    rows[7, 3], rows[UNKNOWNS, 3] = 1.0, cap[BULGE] - noise.bulge
+    weights[3] = 1.0 / noise.bulge_sigma**2
+    scale(rows, weights, 4)
+    add(system, rows, 4)
 
 
 @jit
@@ -217,22 +226,24 @@ def limit(cap: Floats, step: Floats, size: float) -> None:
     step[5] = min(radius, 1.2 * cap[RADIUS]) - cap[RADIUS]
     low, high = 0.2 * radius, 1.3 * radius
     step[6] = min(max(cap[HEIGHT] + step[6], low), high) - cap[HEIGHT]
+    step[7] = min(max(cap[BULGE] + step[7], -BULGE_LIMIT), BULGE_LIMIT) - cap[BULGE]
 
 
 @jit
-def start(cap: Floats, up: Floats, ray: Floats, middle: float, size: float) -> None:
+def start(cap: Floats, up: Floats, ray: Vector, middle: float, size: float) -> None:
     """Fill a cap that stands upright where its circle and its middle depth say."""
     for i in range(3):
         cap[i] = ray[i] / ray[2] * (middle + 0.45 * size)
         cap[N + i] = up[i]
     cap[RADIUS] = 1.03 * size
     cap[HEIGHT] = 0.6 * cap[RADIUS]
+    cap[BULGE] = 0.0
     span(cap)
 
 
 @jit
 def workspace() -> Any:
-    """Return normal matrix (7, 7) and gradient (7,), and room for rows and weights."""
+    """Return normal matrix (8, 8) and gradient (8,), and room for rows and weights."""
     system = (np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS))
     return system, np.empty((UNKNOWNS + 2, ROOM)), np.empty(ROOM)
 
@@ -250,7 +261,7 @@ def build(
     """Fill the normal equations of a cap; return the sum of the weights of its points.
 
     Args:
-        cap: (14,) the estimate.
+        cap: (15,) the estimate.
         data: Points (5, M), edge rays (3, E) and rays around the circle (3, ROUND).
         up: (3,) unit, the upright.
         noise: `Noise`.
@@ -305,7 +316,7 @@ def uncertainty(
     covariance: Floats,
     work: Any,
 ) -> float:
-    """Fill the covariance (7, 7) at the solution; return the weight of the points, -1 if none."""
+    """Fill the covariance (8, 8) at the solution; return the weight of the points, -1 if none."""
     total = build(cap, data, up, noise, focal, (DEPTH_CUTS[-1], EDGE_CUTS[-1]), work)
     if not cholesky(work[0][0]):
         return -1.0
