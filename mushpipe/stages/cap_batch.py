@@ -21,6 +21,7 @@ from mushpipe.stages.cap_model import (
     meet,
     slope,
 )
+from mushpipe.stages.cap_outline import sample_outline
 from mushpipe.stages.cap_samples import (
     CELLS,
     COMPASS,
@@ -111,7 +112,7 @@ def gather(
     data: Any,
 ) -> tuple[int, int, float]:
     """Take the data of a cap; return numbers of points and edge rays, and its middle depth (m)."""
-    points, edges, outline = data
+    points, edges, around = data
     n, middle = sample_depth(image, rank, circle, focal, (sensor[0], sensor[1]), points)
     if n == 0:
         return 0, 0, 0.0
@@ -121,12 +122,13 @@ def gather(
     for j in range(ROUND):
         turn = COMPASS[j * (DIRECTIONS // ROUND)]
         x, y = circle[0] + circle[2] * turn[0], circle[1] + circle[2] * turn[1]
-        outline[0, j], outline[1, j], outline[2, j] = ray_at(image[2], focal, x, y)
+        around[0, j], around[1, j], around[2, j] = ray_at(image[2], focal, x, y)
     return n, m, middle - sensor[2]
 
 
 @jit
 def fit_all(
+    color: NDArray[np.uint8],
     image: Any,
     circles: Floats,
     focal: float,
@@ -140,17 +142,22 @@ def fit_all(
     caps, covariances, surfaces, counts = out
     rank = rank_by_depth(image[0], circles, image[3])
     points, edges = np.empty((5, len(CELLS))), np.empty((3, DIRECTIONS))
-    outline, work = np.empty((3, ROUND)), workspace()
+    around, work = np.empty((3, ROUND)), workspace()
+    outline = np.empty((3, DIRECTIONS))
     for i in range(len(circles)):
-        data = (points, edges, outline)
+        data = (points, edges, around)
         n, m, middle = gather(image, circles[i], rank[i], focal, sensor, data)
         if n < least or middle <= 0.0:
             continue
-        data = (points[:, :n], edges[:, :m], outline)
+        data = (points[:, :n], edges[:, :m], around, outline[:, :0])
         size = circles[i, 2] * middle / focal
         ray = ray_at(image[2], focal, circles[i, 0], circles[i, 1])
         start(caps[i], up, ray, middle, size)
-        if not refine(caps[i], data, up, noise, focal, size, (0, 4), work):
+        if not refine(caps[i], data, up, noise, focal, size, (0, 3), work):
+            continue
+        lines = sample_outline(color, image, rank[i], caps[i], circles[i], focal, outline)
+        data = (points[:, :n], edges[:, :m], around, outline[:, :lines])
+        if not refine(caps[i], data, up, noise, focal, size, (2, 5), work):
             continue
         weight = uncertainty(caps[i], data, up, noise, focal, covariances[i], work)
         if weight < 0.0:
@@ -189,6 +196,7 @@ def locate(cap: Floats, ray: Vector, covariance: Floats, sigma: float, out: Floa
 
 
 def fit_caps(
+    color: NDArray[np.uint8],
     depth: NDArray[Any],
     scale: float,
     bias: float,
@@ -204,6 +212,7 @@ def fit_caps(
     """Fit a cap to the depth in each circle.
 
     Args:
+        color: (H, W, 3) RGB.
         depth: (H, W) native, 0 = missing, finite.
         scale: Metres per unit.
         bias: Taken off the depth, m.
@@ -221,6 +230,7 @@ def fit_caps(
     surfaces, counts = np.full((n, 6), np.nan), np.zeros((n, 3))
     ranks = np.full(depth.shape, n, np.int32)
     fit_all(
+        color,
         (depth, scale, rays, ranks),
         circles,
         focal,

@@ -58,9 +58,10 @@ class CapFit(Stage):
     def open(self) -> None:
         """Compile the kernels."""
         camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+        color = np.zeros((48, 64, 3), np.uint8)
         circles = Circles(np.array([[32.0, 24.0]]), np.array([9.0]), np.ones(1))
         for depth in (np.full((48, 64), 400, np.uint16), np.full((48, 64), 0.4, np.float32)):
-            self._fit(depth, 0.001, camera, circles)
+            self._fit(color, depth, 0.001, camera, circles)
 
     def process(self, frame: RgbdFrame, circles: Circles) -> tuple[Locations, Poses]:
         """Return one location and one pose per circle.
@@ -78,24 +79,35 @@ class CapFit(Stage):
         depth = frame.depth
         if depth.dtype == np.float32:
             depth = np.nan_to_num(depth, posinf=0.0, neginf=0.0)
-        fits = self._fit(depth, frame.depth_scale, frame.camera, circles)
+        fits = self._fit(frame.color, depth, frame.depth_scale, frame.camera, circles)
         return _locations(fits, circles, depth), _poses(fits)
 
-    def _fit(self, depth: NDArray[Any], scale: float, camera: Camera, circles: Circles) -> Fits:
+    def _fit(
+        self,
+        color: NDArray[np.uint8],
+        depth: NDArray[Any],
+        scale: float,
+        camera: Camera,
+        circles: Circles,
+    ) -> Fits:
         rays = self._rays_of(camera)
         noise = Noise(
-            0.0006,
-            0.02,
-            self.circle_sigma_px,
-            2.0,
-            0.6,
-            0.15,
-            0.0,
-            0.06,
-            float(np.radians(self.tilt_deg)),
+            shape=0.0006,
+            outline=0.02,
+            circle_px=self.circle_sigma_px,
+            edge_px=2.0,
+            color_px=1.0,
+            edge_weight=0.6,
+            color_weight=0.6,
+            aspect=0.6,
+            aspect_sigma=0.15,
+            bulge=0.02,
+            bulge_sigma=0.04,
+            tilt=float(np.radians(self.tilt_deg)),
         )
         disc = np.column_stack([circles.center, circles.radius])
         return fit_caps(
+            color,
             depth,
             scale,
             self.depth_bias_mm / 1000,

@@ -29,7 +29,6 @@ _TURN = np.arange(ROUND) * (2 * np.pi / ROUND)
 WAVES: Floats = np.stack([np.ones(ROUND), np.cos(_TURN), np.sin(_TURN)]) / ROUND
 # Noise is correlated between pixels; this share of the points counts.
 EFFECTIVE = 0.35 * 169 / GRID**2
-EDGE_WEIGHT = 0.6
 BULGE_LIMIT = 0.15  # beyond, the profile is no longer convex
 DEPTH_CUTS = np.array([400.0, 81.0, 81.0, 16.0])
 EDGE_CUTS = np.array([25.0, 25.0, 9.0, 9.0])
@@ -43,6 +42,9 @@ class Noise(NamedTuple):
         outline: In rim radii, how far its outline does.
         circle_px: Of the detected circle's centre and radius, px.
         edge_px: Of a depth edge, px.
+        color_px: Of the outline in colour, px.
+        edge_weight: Share of the depth edge's rays that count as independent.
+        color_weight: The same of the rays along the outline in colour.
         aspect: Middle aspect h/R of a cap.
         aspect_sigma: Its spread.
         bulge: Middle bulge of a cap's profile.
@@ -54,6 +56,9 @@ class Noise(NamedTuple):
     outline: float
     circle_px: float
     edge_px: float
+    color_px: float
+    edge_weight: float
+    color_weight: float
     aspect: float
     aspect_sigma: float
     bulge: float
@@ -150,27 +155,29 @@ def add_depth(
 
 
 @jit
-def add_edges(cap: Floats, edges: Floats, noise: Any, pixel: float, cut: float, work: Any) -> None:
-    """Add the rays (3, M) along the depth edge: each touches the cap."""
+def add_edges(
+    cap: Floats, edges: Floats, sigma: float, weight: float, cut: float, work: Any
+) -> None:
+    """Add the rays (3, M) along an edge, which touch the cap within sigma (m)."""
     system, rows, weights = work
     count = edges.shape[1]
     tangent_rows(cap, edges, count, rows)
-    variance = (noise.edge_px * pixel) ** 2 + (noise.outline * cap[RADIUS]) ** 2
+    variance = sigma * sigma
     for j in range(count):
-        weights[j] = EDGE_WEIGHT * tukey(rows[UNKNOWNS, j] ** 2 / variance, cut) / variance
+        weights[j] = weight * tukey(rows[UNKNOWNS, j] ** 2 / variance, cut) / variance
     scale(rows, weights, count)
     add(system, rows, count)
 
 
 @jit
-def add_circle(cap: Floats, outline: Floats, noise: Any, pixel: float, work: Any) -> None:
+def add_circle(cap: Floats, around: Floats, noise: Any, pixel: float, work: Any) -> None:
     """Add the detected circle's three numbers: mean, cosine and sine of its distance to the cap.
 
     The rays (3, ROUND) around the circle touch the cap on average; single ones need not, for the
     outline of a cap is no circle.
     """
     system, rows, weights = work
-    tangent_rows(cap, outline, ROUND, rows)
+    tangent_rows(cap, around, ROUND, rows)
     for i in range(UNKNOWNS + 1):
         for w in range(3):
             total = 0.0
@@ -251,7 +258,7 @@ def workspace() -> Any:
 @jit
 def build(
     cap: Floats,
-    data: tuple[Floats, Floats, Floats],
+    data: tuple[Floats, Floats, Floats, Floats],
     up: Floats,
     noise: Any,
     focal: float,
@@ -262,20 +269,25 @@ def build(
 
     Args:
         cap: (15,) the estimate.
-        data: Points (5, M), edge rays (3, E) and rays around the circle (3, ROUND).
+        data: Points (5, M), rays along the depth edge (3, E), around the circle (3, ROUND) and
+            along the outline in colour (3, L).
         up: (3,) unit, the upright.
         noise: `Noise`.
         focal: Focal length, px.
         cuts: Squared residuals, of points and edges, beyond which one has no weight.
         work: From `workspace`.
     """
-    points, edges, outline = data
+    points, edges, around, outline = data
     work[0][0][:] = 0.0
     work[0][1][:] = 0.0
     pixel = cap[2] / focal
     total = add_depth(cap, points, noise, focal, cuts[0], work)
-    add_edges(cap, edges, noise, pixel, cuts[1], work)
-    add_circle(cap, outline, noise, pixel, work)
+    mismatch = (noise.outline * cap[RADIUS]) ** 2
+    sigma = np.sqrt((noise.edge_px * pixel) ** 2 + mismatch)
+    add_edges(cap, edges, sigma, noise.edge_weight, cuts[1], work)
+    sigma = np.sqrt((noise.color_px * pixel) ** 2 + mismatch)
+    add_edges(cap, outline, sigma, noise.color_weight, cuts[1], work)
+    add_circle(cap, around, noise, pixel, work)
     add_priors(cap, up, noise, work)
     return total
 
@@ -283,7 +295,7 @@ def build(
 @jit
 def refine(
     cap: Floats,
-    data: tuple[Floats, Floats, Floats],
+    data: tuple[Floats, Floats, Floats, Floats],
     up: Floats,
     noise: Any,
     focal: float,
@@ -309,7 +321,7 @@ def refine(
 @jit
 def uncertainty(
     cap: Floats,
-    data: tuple[Floats, Floats, Floats],
+    data: tuple[Floats, Floats, Floats, Floats],
     up: Floats,
     noise: Any,
     focal: float,
