@@ -153,7 +153,7 @@ def fit_all(
         size = circles[i, 2] * middle / focal
         ray = ray_at(image[2], focal, circles[i, 0], circles[i, 1])
         start(caps[i], up, ray, middle, size)
-        if not refine(caps[i], data, up, noise, focal, size, (0, 3), work):
+        if not refine(caps[i], data, up, noise, focal, size, (0, 2), work):
             continue
         lines = sample_outline(color, image, rank[i], caps[i], circles[i], focal, outline)
         data = (points[:, :n], edges[:, :m], around, outline[:, :lines])

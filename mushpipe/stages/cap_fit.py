@@ -93,16 +93,16 @@ class CapFit(Stage):
         rays = self._rays_of(camera)
         noise = Noise(
             shape=0.0006,
-            outline=0.02,
+            outline=0.03,
             circle_px=self.circle_sigma_px,
             edge_px=2.0,
             color_px=1.0,
             edge_weight=0.6,
             color_weight=0.6,
-            aspect=0.6,
-            aspect_sigma=0.15,
-            bulge=0.02,
-            bulge_sigma=0.04,
+            aspect=0.62,
+            aspect_sigma=0.2,
+            bulge=0.0,
+            bulge_sigma=0.06,
             tilt=float(np.radians(self.tilt_deg)),
         )
         disc = np.column_stack([circles.center, circles.radius])
