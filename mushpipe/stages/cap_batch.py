@@ -31,7 +31,8 @@ from mushpipe.stages.cap_samples import (
     sample_depth,
     sample_edges,
 )
-from mushpipe.stages.cap_solve import ROUND, Noise, refine, start, uncertainty, workspace
+from mushpipe.stages.cap_solve import ROUND, Noise, refine, tilt, uncertainty, workspace
+from mushpipe.stages.cap_start import spread_of, start
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +52,8 @@ class Fits:
         sigma_radius: (N,) m.
         sigma_surface: (N, 3) m.
         fitness: (N,) 0..1, mean robust weight of the points of the grid, 0 for a missing one.
-        edges: (N,) number of trusted edge rays.
+        edges: (N,) number of rays along the depth edge.
+        lines: (N,) number of rays along the outline in colour.
     """
 
     valid: NDArray[np.bool_]
@@ -67,6 +69,7 @@ class Fits:
     sigma_surface: Floats
     fitness: Floats
     edges: NDArray[np.int64]
+    lines: NDArray[np.int64]
 
 
 @jit
@@ -127,43 +130,71 @@ def gather(
 
 
 @jit
-def fit_all(
-    color: NDArray[np.uint8],
-    image: Any,
-    circles: Floats,
-    focal: float,
-    up: Floats,
-    noise: Any,
-    sensor: tuple[float, float, float, float],
-    least: int,
-    out: Any,
+def first_fits(
+    frame: Any, circles: Floats, upright: tuple[Floats, float], settings: Any, data: Any, out: Any
 ) -> None:
-    """Fit every cap; see `fit_caps`. A cap without a fit keeps the count 0."""
-    caps, covariances, surfaces, counts = out
-    rank = rank_by_depth(image[0], circles, image[3])
-    points, edges = np.empty((5, len(CELLS))), np.empty((3, DIRECTIONS))
-    around, work = np.empty((3, ROUND)), workspace()
-    outline = np.empty((3, DIRECTIONS))
+    """Gather the data of every cap, and fit it with the same prior for all.
+
+    Args:
+        frame: Luma (H, W), image (see `sample_depth`) and focal length, px.
+        circles: (N, 3) x, y, radius, px.
+        upright: Unit vector (3,) and spread of tilts, rad.
+        settings: `Noise`; sigma of depth (2), bias (m) and edge offset (px); fewest points.
+        data: Per cap room for points, edges, rays around the circle and along the outline.
+        out: Per cap parameters, covariance, surface point with sigmas, and counts of points, edge
+            rays, outline rays, weight; and size, m. A cap without a fit keeps a count of 0.
+    """
+    gray, image, focal = frame
+    noise, sensor, least = settings
+    points, edges, around, outline = data
+    caps, covariances, _, counts = out
+    rank, work = rank_by_depth(image[0], circles, image[3]), workspace()
     for i in range(len(circles)):
-        data = (points, edges, around)
-        n, m, middle = gather(image, circles[i], rank[i], focal, sensor, data)
+        room = (points[i], edges[i], around[i])
+        n, m, middle = gather(image, circles[i], rank[i], focal, sensor, room)
         if n < least or middle <= 0.0:
             continue
-        data = (points[:, :n], edges[:, :m], around, outline[:, :0])
         size = circles[i, 2] * middle / focal
         ray = ray_at(image[2], focal, circles[i, 0], circles[i, 1])
-        start(caps[i], up, ray, middle, size)
-        if not refine(caps[i], data, up, noise, focal, size, (0, 2), work):
+        start(caps[i], points[i], n, upright[0], ray, middle, size)
+        known = (points[i][:, :n], edges[i][:, :m], around[i], outline[i][:, :0])
+        if not refine(caps[i], known, upright, noise, focal, size, (0, 2), work):
             continue
-        lines = sample_outline(color, image, rank[i], caps[i], circles[i], focal, outline)
-        data = (points[:, :n], edges[:, :m], around, outline[:, :lines])
-        if not refine(caps[i], data, up, noise, focal, size, (2, 5), work):
+        lines = sample_outline(gray, image, rank[i], caps[i], circles[i], focal, outline[i])
+        known = (points[i][:, :n], edges[i][:, :m], around[i], outline[i][:, :lines])
+        if not refine(caps[i], known, upright, noise, focal, size, (2, 4), work):
             continue
-        weight = uncertainty(caps[i], data, up, noise, focal, covariances[i], work)
-        if weight < 0.0:
+        if uncertainty(caps[i], known, upright, noise, focal, covariances[i], work) >= 0.0:
+            counts[i, 0], counts[i, 1], counts[i, 2], counts[i, 4] = n, m, lines, size
+
+
+@jit
+def second_fits(
+    frame: Any, circles: Floats, upright: tuple[Floats, float], settings: Any, data: Any, out: Any
+) -> None:
+    """Refine every fit with what the scene says of its caps' tilt; arguments as `first_fits`."""
+    _, image, focal = frame
+    noise = settings[0]
+    points, edges, around, outline = data
+    caps, covariances, surfaces, counts = out
+    squares, variances = np.full(len(caps), -1.0), np.ones(len(caps))
+    for i in range(len(caps)):
+        if counts[i, 0] > 0:
+            first, second = tilt(caps[i], upright[0])
+            squares[i] = first * first + second * second
+            variances[i] = 0.5 * (covariances[i, 3, 3] + covariances[i, 4, 4])
+    spreads, work = np.empty(len(caps)), workspace()
+    spread_of(squares, variances, upright[1], spreads)
+    for i in range(len(caps)):
+        if counts[i, 0] == 0:
             continue
+        n, m, lines = int(counts[i, 0]), int(counts[i, 1]), int(counts[i, 2])
+        known = (points[i][:, :n], edges[i][:, :m], around[i], outline[i][:, :lines])
+        own = (upright[0], spreads[i])
+        refine(caps[i], known, own, noise, focal, counts[i, 4], (4, 5), work)
+        counts[i, 3] = uncertainty(caps[i], known, own, noise, focal, covariances[i], work)
+        ray = ray_at(image[2], focal, circles[i, 0], circles[i, 1])
         locate(caps[i], ray, covariances[i], noise.circle_px / focal, surfaces[i])
-        counts[i, 0], counts[i, 1], counts[i, 2] = n, m, weight
 
 
 @jit
@@ -196,56 +227,45 @@ def locate(cap: Floats, ray: Vector, covariance: Floats, sigma: float, out: Floa
 
 
 def fit_caps(
-    color: NDArray[np.uint8],
-    depth: NDArray[Any],
-    scale: float,
-    bias: float,
-    rays: NDArray[np.float32],
+    frame: tuple[NDArray[np.float32], tuple[NDArray[Any], float, NDArray[np.float32]], float],
     circles: Floats,
-    focal: float,
-    up: Floats,
-    noise: Noise,
-    sensor: tuple[float, float],
-    edge_offset: float,
-    least: int,
+    upright: tuple[Floats, float],
+    settings: tuple[Noise, tuple[float, float, float, float], int],
 ) -> Fits:
     """Fit a cap to the depth in each circle.
 
     Args:
-        color: (H, W, 3) RGB.
-        depth: (H, W) native, 0 = missing, finite.
-        scale: Metres per unit.
-        bias: Taken off the depth, m.
-        rays: (H, W, 2) float32 rays at z = 1.
+        frame: Luma (H, W) 0..1; native depth (H, W), 0 = missing, finite, metres per unit, and the
+            rays (H, W, 2) of the pixels at z = 1; focal length, px.
         circles: (N, 3) x, y, radius, px.
-        focal: Focal length, px.
-        up: (3,) unit, the upright.
-        noise: Standard deviations of the model.
-        sensor: Sigma of depth is sensor[0] + sensor[1] z, m.
-        edge_offset: How much of an edge the sensor loses, px.
-        least: Fewest points that make a fit.
+        upright: Unit vector (3,) and the spread of tilts off it per direction, rad.
+        settings: Standard deviations of the model; of the sensor: sigma of depth at the camera (m)
+            and its growth (m per m), bias (m), and how much of an edge it loses (px); the fewest
+            points that make a fit.
     """
     n = len(circles)
-    caps, covariances = np.full((n, SIZE), np.nan), np.full((n, UNKNOWNS, UNKNOWNS), np.nan)
-    surfaces, counts = np.full((n, 6), np.nan), np.zeros((n, 3))
-    ranks = np.full(depth.shape, n, np.int32)
-    fit_all(
-        color,
-        (depth, scale, rays, ranks),
-        circles,
-        focal,
-        up,
-        noise,
-        (*sensor, bias, edge_offset),
-        least,
-        (caps, covariances, surfaces, counts),
+    gray, image, focal = frame
+    out = (
+        np.full((n, SIZE), np.nan),
+        np.full((n, UNKNOWNS, UNKNOWNS), np.nan),
+        np.full((n, 6), np.nan),
+        np.zeros((n, 5)),
     )
-    return _fits(caps, covariances, surfaces, counts)
+    data = (
+        np.empty((n, 5, len(CELLS))),
+        np.empty((n, 3, DIRECTIONS)),
+        np.empty((n, 3, ROUND)),
+        np.empty((n, 3, DIRECTIONS)),
+    )
+    ranked = (gray, (*image, np.full(image[0].shape, n, np.int32)), focal)
+    first_fits(ranked, circles, upright, settings, data, out)
+    second_fits(ranked, circles, upright, settings, data, out)
+    return _fits(*out)
 
 
 def _fits(caps: Floats, covariances: Floats, surfaces: Floats, counts: Floats) -> Fits:
     finite = np.isfinite(caps).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
-    valid = (counts[:, 0] > 0) & finite & np.isfinite(surfaces).all(axis=1)
+    valid = (counts[:, 0] > 0) & (counts[:, 3] >= 0) & finite & np.isfinite(surfaces).all(axis=1)
     for array in (caps, covariances, surfaces):
         array[~valid] = np.nan
     diagonal = np.diagonal(covariances, axis1=1, axis2=2)
@@ -262,6 +282,7 @@ def _fits(caps: Floats, covariances: Floats, surfaces: Floats, counts: Floats) -
         np.sqrt(diagonal[:, 3] + diagonal[:, 4]),
         np.sqrt(diagonal[:, 5]),
         surfaces[:, 3:],
-        np.where(valid, np.minimum(counts[:, 2] / len(CELLS), 1.0), np.nan),
+        np.where(valid, np.minimum(counts[:, 3] / len(CELLS), 1.0), np.nan),
         counts[:, 1].astype(np.int64),
+        counts[:, 2].astype(np.int64),
     )

@@ -51,6 +51,9 @@ class CapFit(Stage):
         0.45, ge=-3, le=3, description="how much of a cap's edge the depth camera loses, px"
     )
     circle_sigma_px: float = Field(2, gt=0, description="sigma of the circles, px")
+    outline_sigma_px: float = Field(
+        1, gt=0, description="sigma of the outline in the colour image, alignment included, px"
+    )
     min_points: int = Field(8, ge=6, le=97, description="fewest of 97 points a fit needs")
 
     _rays: tuple[Camera, NDArray[np.float32]] | None = PrivateAttr(None)
@@ -58,10 +61,13 @@ class CapFit(Stage):
     def open(self) -> None:
         """Compile the kernels."""
         camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
-        color = np.zeros((48, 64, 3), np.uint8)
         circles = Circles(np.array([[32.0, 24.0]]), np.array([9.0]), np.ones(1))
+        gray = np.zeros((48, 64), np.float32)
         for depth in (np.full((48, 64), 400, np.uint16), np.full((48, 64), 0.4, np.float32)):
-            self._fit(color, depth, 0.001, camera, circles)
+            # arrays of a frame are read-only, which to the compiler is a type of its own
+            locked = depth.copy()
+            locked.flags.writeable = gray.flags.writeable = False
+            self.fit(gray, locked, 0.001, camera, circles)
 
     def process(self, frame: RgbdFrame, circles: Circles) -> tuple[Locations, Poses]:
         """Return one location and one pose per circle.
@@ -79,46 +85,52 @@ class CapFit(Stage):
         depth = frame.depth
         if depth.dtype == np.float32:
             depth = np.nan_to_num(depth, posinf=0.0, neginf=0.0)
-        fits = self._fit(frame.color, depth, frame.depth_scale, frame.camera, circles)
+            depth.flags.writeable = False
+        fits = self.fit(frame.gray, depth, frame.depth_scale, frame.camera, circles)
         return _locations(fits, circles, depth), _poses(fits)
 
-    def _fit(
+    def fit(
         self,
-        color: NDArray[np.uint8],
+        gray: NDArray[np.float32],
         depth: NDArray[Any],
         scale: float,
         camera: Camera,
         circles: Circles,
     ) -> Fits:
+        """Return the fitted caps themselves.
+
+        Args:
+            gray: (H, W) luma, 0..1.
+            depth: (H, W) native, 0 = missing, finite.
+            scale: Metres per unit of depth.
+            camera: Intrinsics.
+            circles: Outlines, px.
+        """
         rays = self._rays_of(camera)
         noise = Noise(
             shape=0.0006,
             outline=0.03,
             circle_px=self.circle_sigma_px,
             edge_px=2.0,
-            color_px=1.0,
+            color_px=self.outline_sigma_px,
             edge_weight=0.6,
             color_weight=0.6,
             aspect=0.62,
             aspect_sigma=0.2,
             bulge=0.0,
             bulge_sigma=0.06,
-            tilt=float(np.radians(self.tilt_deg)),
         )
-        disc = np.column_stack([circles.center, circles.radius])
-        return fit_caps(
-            color,
-            depth,
-            scale,
+        sensor = (
+            self.depth_noise_mm / 1000,
+            self.depth_noise_per_m / 1000,
             self.depth_bias_mm / 1000,
-            rays,
-            disc,
-            (camera.fx + camera.fy) / 2,
-            self._upright(depth, scale, rays),
-            noise,
-            (self.depth_noise_mm / 1000, self.depth_noise_per_m / 1000),
             self.edge_offset_px,
-            self.min_points,
+        )
+        return fit_caps(
+            (gray, (depth, scale, rays), (camera.fx + camera.fy) / 2),
+            np.column_stack([circles.center, circles.radius]),
+            (self._upright(depth, scale, rays), float(np.radians(self.tilt_deg))),
+            (noise, sensor, self.min_points),
         )
 
     def _rays_of(self, camera: Camera) -> NDArray[np.float32]:

@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.jit import jit
+from mushpipe.core.jit import inlined, jit
 
 Floats = NDArray[np.float64]
 Cap = tuple[float, ...]
@@ -27,6 +27,7 @@ Vector = tuple[float, float, float]
 LIP = 0.25  # depth of the margin below the rim plane, in rim radii
 SIZE = 15
 N, RADIUS, HEIGHT, BULGE, E1, E2 = 3, 6, 7, 8, 9, 12
+ROOM = 97  # most points or rays of a cap
 UNKNOWNS = 8  # C (3), turn along e1 and e2 (2), R, h, b
 
 
@@ -57,7 +58,7 @@ def move(cap: Floats, step: Floats) -> None:
     span(cap)
 
 
-@jit
+@inlined
 def frozen(cap: Floats) -> Cap:
     """Return the array (15,) as a tuple."""
     return (
@@ -66,13 +67,13 @@ def frozen(cap: Floats) -> Cap:
     )  # fmt: skip
 
 
-@jit
+@inlined
 def dot(a: Vector, b: Vector) -> float:
     """Return the scalar product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@jit
+@inlined
 def enter(c: Cap, ray: Vector, k: float, tangent: bool) -> tuple[float, float, bool]:
     """Return (t, s, hit) for one half of a cap, taken as a whole spheroid without bulge.
 
@@ -100,7 +101,7 @@ def enter(c: Cap, ray: Vector, k: float, tangent: bool) -> tuple[float, float, b
     return t, t * un + qn, free > 0.0
 
 
-@jit
+@inlined
 def meet(c: Cap, ray: Vector, tangent: bool) -> tuple[float, float, bool]:
     """Return (t, k, hit): where a ray meets the cap, in which half, and whether it does at all."""
     lip = LIP * c[RADIUS]
@@ -110,7 +111,7 @@ def meet(c: Cap, ray: Vector, tangent: bool) -> tuple[float, float, bool]:
     return (t if dome else t_lip), (c[HEIGHT] if dome else lip), (hit if dome else hit_lip)
 
 
-@jit
+@inlined
 def slope(c: Cap, ray: Vector, t: float, k: float) -> tuple[float, ...]:
     """Return P = F - 1 - b w at the point t ray, in the half with half-axis k, and how it changes.
 
@@ -123,11 +124,11 @@ def slope(c: Cap, ray: Vector, t: float, k: float) -> tuple[float, ...]:
     inverse = 1.0 / (c[RADIUS] * c[RADIUS])
     d = 1.0 / (k * k) - inverse
     s, square = dot(q, axis), dot(q, q)
-    dome = s > 0.0
+    dome = 1.0 if s > 0.0 else 0.0  # a factor, for branches keep rays from being worked on at once
     f = np.sqrt(max(square * inverse + d * s * s, 1e-12))
-    x = min(s * s / (k * k * f * f), 1.0) if dome else 0.0
+    x = dome * s * s / (k * k * f * f)
     # w depends on F and on s: dP = own dF + by_s ds
-    bend = 4.0 * c[BULGE] * (1.0 - 2.0 * x) if dome else 0.0
+    bend = dome * 4.0 * c[BULGE] * (1.0 - 2.0 * x)
     own = (1.0 + 2.0 * bend * x / f) / f
     by_s = -2.0 * bend * s / (k * k * f * f)
     lean = own * d * s + by_s
@@ -150,15 +151,15 @@ def slope(c: Cap, ray: Vector, t: float, k: float) -> tuple[float, ...]:
         -g[2] * over,
         lean * dot(q, (c[E1], c[E1 + 1], c[E1 + 2])) * over,
         lean * dot(q, (c[E2], c[E2 + 1], c[E2 + 2])) * over,
-        -own * (by_radius + (0.0 if dome else by_half / c[RADIUS])) * over,
-        (-own * by_half + 2.0 * bend * x) / k * over if dome else 0.0,
+        -own * (by_radius + (1.0 - dome) * by_half / c[RADIUS]) * over,
+        dome * (2.0 * bend * x - own * by_half) / k * over,
         -w * over,
     )
 
 
 @jit
-def depth_rows(cap: Floats, points: Floats, count: int, rows: Floats) -> None:
-    """Fill a column of `rows` for each of the measured points.
+def depth_rows(cap: Floats, points: Floats, count: int, flat: Floats) -> None:
+    """Fill a column of rows for each of the measured points.
 
     The residual is the distance from the point to the cap along the ray, times the cosine of
     incidence. A ray that misses has the distance from its closest approach, and a cosine of 0:
@@ -167,32 +168,43 @@ def depth_rows(cap: Floats, points: Floats, count: int, rows: Floats) -> None:
     Args:
         cap: (15,).
         points: (5, M): unit ray (3), range and its sigma, m.
-        count: How many columns are points.
-        rows: (10, M) out: derivatives (8), the cosine held fixed; residual, m; cosine.
+        count: How many columns are points, at most ROOM.
+        flat: (14 ROOM,) out, rows of ROOM: derivatives (8), the cosine held fixed; residual, m;
+            cosine; then a copy of the rays and ranges. In one array at fixed distances the
+            compiler sees that nothing overlaps.
     """
     c = frozen(cap)
+    for i in range(4):
+        for j in range(count):
+            flat[(10 + i) * ROOM + j] = points[i, j]
     for j in range(count):
-        ray = (points[0, j], points[1, j], points[2, j])
+        ray = (flat[j + 10 * ROOM], flat[j + 11 * ROOM], flat[j + 12 * ROOM])
         t, k, hit = meet(c, ray, False)
         p, length, cosine, d0, d1, d2, d3, d4, d5, d6, d7 = slope(c, ray, t, k)
-        rows[0, j], rows[1, j], rows[2, j], rows[3, j] = d0, d1, d2, d3
-        rows[4, j], rows[5, j], rows[6, j], rows[7, j] = d4, d5, d6, d7
+        flat[j], flat[j + ROOM], flat[j + 2 * ROOM], flat[j + 3 * ROOM] = d0, d1, d2, d3
+        flat[j + 4 * ROOM], flat[j + 5 * ROOM] = d4, d5
+        flat[j + 6 * ROOM], flat[j + 7 * ROOM] = d6, d7
         # one Newton step from the spheroid without bulge to the surface with it
-        rows[8, j] = p / length + (cosine * (t - points[3, j]) if hit else 0.0)
-        rows[9, j] = cosine if hit else 0.0
+        off = cosine * (t - flat[j + 13 * ROOM])
+        flat[j + 8 * ROOM] = p / length + (off if hit else 0.0)
+        flat[j + 9 * ROOM] = cosine if hit else 0.0
 
 
 @jit
-def tangent_rows(cap: Floats, rays: Floats, count: int, rows: Floats) -> None:
-    """Fill a column of `rows` for each ray (3, M) of an outline.
+def tangent_rows(cap: Floats, rays: Floats, count: int, flat: Floats) -> None:
+    """Fill a column of rows for each ray (3, M) of an outline; `flat` as in `depth_rows`.
 
     The residual is how far outside (negative: inside) the cap's outline the ray passes, m.
     """
     c = frozen(cap)
+    for i in range(3):
+        for j in range(count):
+            flat[(10 + i) * ROOM + j] = rays[i, j]
     for j in range(count):
-        ray = (rays[0, j], rays[1, j], rays[2, j])
+        ray = (flat[j + 10 * ROOM], flat[j + 11 * ROOM], flat[j + 12 * ROOM])
         t, k, _ = meet(c, ray, True)
         p, length, _, d0, d1, d2, d3, d4, d5, d6, d7 = slope(c, ray, t, k)
-        rows[0, j], rows[1, j], rows[2, j], rows[3, j] = d0, d1, d2, d3
-        rows[4, j], rows[5, j], rows[6, j], rows[7, j] = d4, d5, d6, d7
-        rows[8, j] = p / length
+        flat[j], flat[j + ROOM], flat[j + 2 * ROOM], flat[j + 3 * ROOM] = d0, d1, d2, d3
+        flat[j + 4 * ROOM], flat[j + 5 * ROOM] = d4, d5
+        flat[j + 6 * ROOM], flat[j + 7 * ROOM] = d6, d7
+        flat[j + 8 * ROOM] = p / length

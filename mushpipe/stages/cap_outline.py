@@ -16,22 +16,19 @@ from mushpipe.stages.cap_samples import COMPASS, DIRECTIONS, ray_at
 
 STEP = 0.5  # px between places on a line
 REACH = 12  # steps to either side that are looked at, at most
-LEAST_STEP = 10.0  # of 255, between 1 px inside and 1 px outside
+LEAST_STEP = 0.04  # of luma, between 1 px inside and 1 px outside
 
 
 @jit
-def luma(color: NDArray[np.uint8], x: float, y: float) -> float:
-    """Return the bilinear luma (ITU-R BT.601, 0..255) at a place in the image, -1 outside."""
+def bright(gray: NDArray[np.float32], x: float, y: float) -> float:
+    """Return the bilinear luma at a place in the image, -1 outside."""
     u, v = int(np.floor(x)), int(np.floor(y))
-    if u < 0 or v < 0 or u + 1 >= color.shape[1] or v + 1 >= color.shape[0]:
+    if u < 0 or v < 0 or u + 1 >= gray.shape[1] or v + 1 >= gray.shape[0]:
         return -1.0
-    fx, fy, total = x - u, y - v, 0.0
-    for c in range(3):
-        share = 0.299 if c == 0 else (0.587 if c == 1 else 0.114)
-        top = color[v, u, c] * (1.0 - fx) + color[v, u + 1, c] * fx
-        low = color[v + 1, u, c] * (1.0 - fx) + color[v + 1, u + 1, c] * fx
-        total += share * (top * (1.0 - fy) + low * fy)
-    return total
+    fx, fy = x - u, y - v
+    top = gray[v, u] * (1.0 - fx) + gray[v, u + 1] * fx
+    low = gray[v + 1, u] * (1.0 - fx) + gray[v + 1, u + 1] * fx
+    return top * (1.0 - fy) + low * fy
 
 
 @jit
@@ -40,7 +37,7 @@ def expected_reach(
 ) -> float:
     """Return how far from (x, y), px, the outline of a cap lies in the direction turn (2,)."""
     reach = radius
-    for _ in range(3):
+    for _ in range(2):
         ray = ray_at(rays, focal, x + reach * turn[0], y + reach * turn[1])
         t, k, _ = meet(c, ray, True)
         change = slope(c, ray, t, k)
@@ -75,13 +72,13 @@ def steepest(profile: Floats, count: int, sign: float) -> tuple[float, float]:
 
 @jit
 def sample_outline(
-    color: NDArray[np.uint8], image: Any, rank: int, cap: Floats, circle: Floats, focal: float,
+    gray: NDArray[np.float32], image: Any, rank: int, cap: Floats, circle: Floats, focal: float,
     out: Floats,
 ) -> int:  # fmt: skip
     """Find the outline of a cap in the colour image, in 32 directions.
 
     Args:
-        color: (H, W, 3) RGB.
+        gray: (H, W) luma, 0..1.
         image: Depth, scale, rays (H, W, 2), and ranks (H, W) of the nearest circle per pixel.
         rank: This circle's; a place that a nearer one covers is left out.
         cap: (15,) the estimate.
@@ -110,7 +107,7 @@ def sample_outline(
         known = True
         for k in range(count):
             along = (k - half) * STEP
-            profiles[j, k] = luma(color, x + along * turn[0], y + along * turn[1])
+            profiles[j, k] = bright(gray, x + along * turn[0], y + along * turn[1])
             known = known and profiles[j, k] >= 0.0
         if known:
             reaches[j] = reach

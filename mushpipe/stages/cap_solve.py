@@ -10,21 +10,20 @@ from mushpipe.core.jit import jit
 from mushpipe.stages.cap_model import (
     BULGE,
     E1,
+    E2,
     HEIGHT,
     RADIUS,
+    ROOM,
     UNKNOWNS,
     Floats,
     N,
-    Vector,
     depth_rows,
     move,
-    span,
     tangent_rows,
 )
-from mushpipe.stages.cap_samples import CELLS, GRID
+from mushpipe.stages.cap_samples import GRID
 
-ROUND = 16  # rays around the detected circle
-ROOM = max(len(CELLS), 2 * ROUND)
+ROUND = 8  # rays around the detected circle
 _TURN = np.arange(ROUND) * (2 * np.pi / ROUND)
 WAVES: Floats = np.stack([np.ones(ROUND), np.cos(_TURN), np.sin(_TURN)]) / ROUND
 # Noise is correlated between pixels; this share of the points counts.
@@ -49,7 +48,6 @@ class Noise(NamedTuple):
         aspect_sigma: Its spread.
         bulge: Middle bulge of a cap's profile.
         bulge_sigma: Its spread.
-        tilt: rad, spread of the tilt off the upright, per direction.
     """
 
     shape: float
@@ -63,7 +61,6 @@ class Noise(NamedTuple):
     aspect_sigma: float
     bulge: float
     bulge_sigma: float
-    tilt: float
 
 
 @jit
@@ -138,9 +135,9 @@ def add_depth(
     cap: Floats, points: Floats, noise: Any, focal: float, cut: float, work: Any
 ) -> float:
     """Add the points (5, M) of a cap; return the sum of their robust weights."""
-    system, rows, weights = work
+    system, flat, rows, weights = work
     count = points.shape[1]
-    depth_rows(cap, points, count, rows)
+    depth_rows(cap, points, count, flat)
     total = 0.0
     for j in range(count):
         cosine, residual = rows[UNKNOWNS + 1, j], rows[UNKNOWNS, j]
@@ -159,9 +156,9 @@ def add_edges(
     cap: Floats, edges: Floats, sigma: float, weight: float, cut: float, work: Any
 ) -> None:
     """Add the rays (3, M) along an edge, which touch the cap within sigma (m)."""
-    system, rows, weights = work
+    system, flat, rows, weights = work
     count = edges.shape[1]
-    tangent_rows(cap, edges, count, rows)
+    tangent_rows(cap, edges, count, flat)
     variance = sigma * sigma
     for j in range(count):
         weights[j] = weight * tukey(rows[UNKNOWNS, j] ** 2 / variance, cut) / variance
@@ -176,8 +173,8 @@ def add_circle(cap: Floats, around: Floats, noise: Any, pixel: float, work: Any)
     The rays (3, ROUND) around the circle touch the cap on average; single ones need not, for the
     outline of a cap is no circle.
     """
-    system, rows, weights = work
-    tangent_rows(cap, around, ROUND, rows)
+    system, flat, rows, weights = work
+    tangent_rows(cap, around, ROUND, flat)
     for i in range(UNKNOWNS + 1):
         for w in range(3):
             total = 0.0
@@ -196,22 +193,28 @@ def add_circle(cap: Floats, around: Floats, noise: Any, pixel: float, work: Any)
 
 
 @jit
-def add_priors(cap: Floats, up: Floats, noise: Any, work: Any) -> None:
+def tilt(cap: Floats, up: Floats) -> tuple[float, float]:
+    """Return the turn along e1 and e2 (rad) that takes the upright to a cap's axis."""
+    cosine = min(max(cap[N] * up[0] + cap[N + 1] * up[1] + cap[N + 2] * up[2], -1.0), 1.0)
+    stretch = -np.arccos(cosine) / np.sqrt(max(1.0 - cosine * cosine, 1e-18))
+    first = cap[E1] * up[0] + cap[E1 + 1] * up[1] + cap[E1 + 2] * up[2]
+    second = cap[E2] * up[0] + cap[E2 + 1] * up[1] + cap[E2 + 2] * up[2]
+    return stretch * first, stretch * second
+
+
+@jit
+def add_priors(cap: Floats, upright: tuple[Floats, float], noise: Any, work: Any) -> None:
     """Add what is known of any cap: its aspect, and that it grows upwards, more or less."""
-    system, rows, weights = work
+    system, _, rows, weights = work
     rows[: UNKNOWNS + 1, :4] = 0.0
     rows[5, 0], rows[6, 0] = -noise.aspect, 1.0
     rows[UNKNOWNS, 0] = cap[HEIGHT] - noise.aspect * cap[RADIUS]
     weights[0] = 1.0 / (noise.aspect_sigma * cap[RADIUS]) ** 2
-    # the turn that takes n to the upright: its direction across n, as long as the angle
-    cosine = min(max(cap[N] * up[0] + cap[N + 1] * up[1] + cap[N + 2] * up[2], -1.0), 1.0)
-    stretch = np.arccos(cosine) / np.sqrt(max(1.0 - cosine * cosine, 1e-18))
+    lean = tilt(cap, upright[0])
     for w in range(2):
-        e = E1 + 3 * w
         rows[3 + w, 1 + w] = 1.0
-        off = cap[e] * up[0] + cap[e + 1] * up[1] + cap[e + 2] * up[2]
-        rows[UNKNOWNS, 1 + w] = -off * stretch
-        weights[1 + w] = 1.0 / noise.tilt**2
+        rows[UNKNOWNS, 1 + w] = lean[w]
+        weights[1 + w] = 1.0 / upright[1] ** 2
     rows[7, 3], rows[UNKNOWNS, 3] = 1.0, cap[BULGE] - noise.bulge
     weights[3] = 1.0 / noise.bulge_sigma**2
     scale(rows, weights, 4)
@@ -237,29 +240,18 @@ def limit(cap: Floats, step: Floats, size: float) -> None:
 
 
 @jit
-def start(cap: Floats, up: Floats, ray: Vector, middle: float, size: float) -> None:
-    """Fill a cap that stands upright where its circle and its middle depth say."""
-    for i in range(3):
-        cap[i] = ray[i] / ray[2] * (middle + 0.45 * size)
-        cap[N + i] = up[i]
-    cap[RADIUS] = 1.03 * size
-    cap[HEIGHT] = 0.6 * cap[RADIUS]
-    cap[BULGE] = 0.0
-    span(cap)
-
-
-@jit
 def workspace() -> Any:
-    """Return normal matrix (8, 8) and gradient (8,), and room for rows and weights."""
+    """Return normal matrix (8, 8) and gradient (8,), rows flat and not, and weights (ROOM,)."""
     system = (np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS))
-    return system, np.empty((UNKNOWNS + 2, ROOM)), np.empty(ROOM)
+    flat = np.zeros(14 * ROOM)
+    return system, flat, flat.reshape(14, ROOM), np.empty(ROOM)
 
 
 @jit
 def build(
     cap: Floats,
     data: tuple[Floats, Floats, Floats, Floats],
-    up: Floats,
+    upright: tuple[Floats, float],
     noise: Any,
     focal: float,
     cuts: tuple[float, float],
@@ -271,7 +263,7 @@ def build(
         cap: (15,) the estimate.
         data: Points (5, M), rays along the depth edge (3, E), around the circle (3, ROUND) and
             along the outline in colour (3, L).
-        up: (3,) unit, the upright.
+        upright: Unit vector (3,) and the spread of tilts off it, rad.
         noise: `Noise`.
         focal: Focal length, px.
         cuts: Squared residuals, of points and edges, beyond which one has no weight.
@@ -288,7 +280,7 @@ def build(
     sigma = np.sqrt((noise.color_px * pixel) ** 2 + mismatch)
     add_edges(cap, outline, sigma, noise.color_weight, cuts[1], work)
     add_circle(cap, around, noise, pixel, work)
-    add_priors(cap, up, noise, work)
+    add_priors(cap, upright, noise, work)
     return total
 
 
@@ -296,7 +288,7 @@ def build(
 def refine(
     cap: Floats,
     data: tuple[Floats, Floats, Floats, Floats],
-    up: Floats,
+    upright: tuple[Floats, float],
     noise: Any,
     focal: float,
     size: float,
@@ -307,7 +299,7 @@ def refine(
     normal, gradient = work[0]
     for k in range(steps[0], steps[1]):
         m = min(k, len(DEPTH_CUTS) - 1)
-        build(cap, data, up, noise, focal, (DEPTH_CUTS[m], EDGE_CUTS[m]), work)
+        build(cap, data, upright, noise, focal, (DEPTH_CUTS[m], EDGE_CUTS[m]), work)
         if not cholesky(normal):
             return False
         substitute(normal, gradient)
@@ -322,14 +314,14 @@ def refine(
 def uncertainty(
     cap: Floats,
     data: tuple[Floats, Floats, Floats, Floats],
-    up: Floats,
+    upright: tuple[Floats, float],
     noise: Any,
     focal: float,
     covariance: Floats,
     work: Any,
 ) -> float:
     """Fill the covariance (8, 8) at the solution; return the weight of the points, -1 if none."""
-    total = build(cap, data, up, noise, focal, (DEPTH_CUTS[-1], EDGE_CUTS[-1]), work)
+    total = build(cap, data, upright, noise, focal, (DEPTH_CUTS[-1], EDGE_CUTS[-1]), work)
     if not cholesky(work[0][0]):
         return -1.0
     for i in range(UNKNOWNS):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mushpipe.core.jit import jit
 
 Floats = NDArray[np.float64]
-CELL, STRIDE = 32, 4
+CELL, STRIDE = 32, 8
 _SAMPLES = (CELL // STRIDE) ** 2
 
 
@@ -59,7 +59,7 @@ def bed_normal(
         return None
     basis, inverse = np.insert(points[:, :2], 2, 1.0, axis=1), 1 / points[:, 2]
     weight = np.ones(len(points))
-    for _ in range(10):
+    for _ in range(8):
         weighted = basis * weight[:, None]
         plane = np.linalg.solve(weighted.T @ basis + 1e-9 * np.eye(3), weighted.T @ inverse)
         above = 1 / np.maximum(basis @ plane, 1e-3) - points[:, 2]
