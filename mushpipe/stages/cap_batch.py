@@ -73,8 +73,8 @@ class Fits:
 
 
 @jit
-def core_depth(depth: NDArray[Any], circle: Floats) -> float:
-    """Return the median native depth near the centre of a circle (x, y, r), 0 without any."""
+def core_depth(depth: NDArray[np.float32], circle: Floats) -> float:
+    """Return the median depth (m) near the centre of a circle (x, y, r), 0 without any."""
     values = np.empty(81)
     n = 0
     for i in range(-4, 5):
@@ -89,7 +89,7 @@ def core_depth(depth: NDArray[Any], circle: Floats) -> float:
 
 @jit
 def rank_by_depth(
-    depth: NDArray[Any], circles: Floats, ranks: NDArray[np.int32]
+    depth: NDArray[np.float32], circles: Floats, ranks: NDArray[np.int32]
 ) -> NDArray[np.int64]:
     """Return each circle's rank (N,), the nearest 0, and paint them over a `ranks` full of N."""
     far = np.empty(len(circles))
@@ -125,7 +125,7 @@ def gather(
     for j in range(ROUND):
         turn = COMPASS[j * (DIRECTIONS // ROUND)]
         x, y = circle[0] + circle[2] * turn[0], circle[1] + circle[2] * turn[1]
-        around[0, j], around[1, j], around[2, j] = ray_at(image[2], focal, x, y)
+        around[0, j], around[1, j], around[2, j] = ray_at(image[1], focal, x, y)
     return n, m, middle - sensor[2]
 
 
@@ -148,19 +148,21 @@ def first_fits(
     noise, sensor, least = settings
     points, edges, around, outline = data
     caps, covariances, _, counts = out
-    rank, work = rank_by_depth(image[0], circles, image[3]), workspace()
+    rank, work = rank_by_depth(image[0], circles, image[2]), workspace()
     for i in range(len(circles)):
         room = (points[i], edges[i], around[i])
         n, m, middle = gather(image, circles[i], rank[i], focal, sensor, room)
         if n < least or middle <= 0.0:
             continue
         size = circles[i, 2] * middle / focal
-        ray = ray_at(image[2], focal, circles[i, 0], circles[i, 1])
+        ray = ray_at(image[1], focal, circles[i, 0], circles[i, 1])
         start(caps[i], points[i], n, upright[0], ray, middle, size)
         known = (points[i][:, :n], edges[i][:, :m], around[i], outline[i][:, :0])
         if not refine(caps[i], known, upright, noise, focal, size, (0, 2), work):
             continue
-        lines = sample_outline(gray, image, rank[i], caps[i], circles[i], focal, outline[i])
+        lines = sample_outline(
+            gray, image[1], image[2], rank[i], caps[i], circles[i], focal, outline[i]
+        )
         known = (points[i][:, :n], edges[i][:, :m], around[i], outline[i][:, :lines])
         if not refine(caps[i], known, upright, noise, focal, size, (2, 4), work):
             continue
@@ -193,7 +195,7 @@ def second_fits(
         own = (upright[0], spreads[i])
         refine(caps[i], known, own, noise, focal, counts[i, 4], (4, 5), work)
         counts[i, 3] = uncertainty(caps[i], known, own, noise, focal, covariances[i], work)
-        ray = ray_at(image[2], focal, circles[i, 0], circles[i, 1])
+        ray = ray_at(image[1], focal, circles[i, 0], circles[i, 1])
         locate(caps[i], ray, covariances[i], noise.circle_px / focal, surfaces[i])
 
 
@@ -227,7 +229,7 @@ def locate(cap: Floats, ray: Vector, covariance: Floats, sigma: float, out: Floa
 
 
 def fit_caps(
-    frame: tuple[NDArray[np.float32], tuple[NDArray[Any], float, NDArray[np.float32]], float],
+    frame: tuple[NDArray[np.float32], tuple[NDArray[np.float32], NDArray[np.float32]], float],
     circles: Floats,
     upright: tuple[Floats, float],
     settings: tuple[Noise, tuple[float, float, float, float], int],
@@ -235,8 +237,8 @@ def fit_caps(
     """Fit a cap to the depth in each circle.
 
     Args:
-        frame: Luma (H, W) 0..1; native depth (H, W), 0 = missing, finite, metres per unit, and the
-            rays (H, W, 2) of the pixels at z = 1; focal length, px.
+        frame: Luma (H, W) 0..1; depth (H, W) m, 0 = missing, finite, and the rays (H, W, 2) of the
+            pixels at z = 1; focal length, px.
         circles: (N, 3) x, y, radius, px.
         upright: Unit vector (3,) and the spread of tilts off it per direction, rad.
         settings: Standard deviations of the model; of the sensor: sigma of depth at the camera (m)

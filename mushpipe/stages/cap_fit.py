@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,11 +63,10 @@ class CapFit(Stage):
         camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
         circles = Circles(np.array([[32.0, 24.0]]), np.array([9.0]), np.ones(1))
         gray = np.zeros((48, 64), np.float32)
-        for depth in (np.full((48, 64), 400, np.uint16), np.full((48, 64), 0.4, np.float32)):
-            # arrays of a frame are read-only, which to the compiler is a type of its own
-            locked = depth.copy()
-            locked.flags.writeable = gray.flags.writeable = False
-            self.fit(gray, locked, 0.001, camera, circles)
+        depth = np.full((48, 64), 0.4, np.float32)
+        # arrays of a frame are read-only, which to the compiler is a type of its own
+        gray.flags.writeable = False
+        self.fit(gray, depth, camera, circles)
 
     def process(self, frame: RgbdFrame, circles: Circles) -> tuple[Locations, Poses]:
         """Return one location and one pose per circle.
@@ -82,18 +81,14 @@ class CapFit(Stage):
                 "depth cannot be turned into metres without the camera's calibration: record "
                 "camera_info, or set source.camera: {fx: , fy: , cx: , cy: }"
             )
-        depth = frame.depth
-        if depth.dtype == np.float32:
-            depth = np.nan_to_num(depth, posinf=0.0, neginf=0.0)
-            depth.flags.writeable = False
-        fits = self.fit(frame.gray, depth, frame.depth_scale, frame.camera, circles)
+        depth = np.fmax(frame.depth_m, np.float32(0))  # missing: 0 in place of NaN
+        fits = self.fit(frame.gray, depth, frame.camera, circles)
         return _locations(fits, circles, depth), _poses(fits)
 
     def fit(
         self,
         gray: NDArray[np.float32],
-        depth: NDArray[Any],
-        scale: float,
+        depth: NDArray[np.float32],
         camera: Camera,
         circles: Circles,
     ) -> Fits:
@@ -101,8 +96,7 @@ class CapFit(Stage):
 
         Args:
             gray: (H, W) luma, 0..1.
-            depth: (H, W) native, 0 = missing, finite.
-            scale: Metres per unit of depth.
+            depth: (H, W) m, 0 = missing, finite.
             camera: Intrinsics.
             circles: Outlines, px.
         """
@@ -127,9 +121,9 @@ class CapFit(Stage):
             self.edge_offset_px,
         )
         return fit_caps(
-            (gray, (depth, scale, rays), (camera.fx + camera.fy) / 2),
+            (gray, (depth, rays), (camera.fx + camera.fy) / 2),
             np.column_stack([circles.center, circles.radius]),
-            (self._upright(depth, scale, rays), float(np.radians(self.tilt_deg))),
+            (self._upright(depth, rays), float(np.radians(self.tilt_deg))),
             (noise, sensor, self.min_points),
         )
 
@@ -141,15 +135,15 @@ class CapFit(Stage):
             self._rays = camera, np.nan_to_num(points, nan=1e6).astype(np.float32)
         return self._rays[1]
 
-    def _upright(self, depth: NDArray[Any], scale: float, rays: NDArray[np.float32]) -> Floats:
+    def _upright(self, depth: NDArray[np.float32], rays: NDArray[np.float32]) -> Floats:
         if isinstance(self.up, tuple):
             vector = np.array(self.up)
             return np.asarray(vector / np.linalg.norm(vector))
-        normal = bed_normal(depth, scale, rays) if self.up == "bed" else None
+        normal = bed_normal(depth, rays) if self.up == "bed" else None
         return np.array([0.0, 0.0, -1.0]) if normal is None else normal
 
 
-def _locations(fits: Fits, circles: Circles, depth: NDArray[Any]) -> Locations:
+def _locations(fits: Fits, circles: Circles, depth: NDArray[np.float32]) -> Locations:
     u, v = np.rint(circles.center).astype(int).T
     height, width = depth.shape
     inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)

@@ -5,8 +5,6 @@ Depth cameras tear and lose the edge of a cap; the colour image shows it to a fr
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,12 +26,12 @@ def bright(gray: NDArray[np.float32], x: float, y: float) -> float:
     fx, fy = x - u, y - v
     top = gray[v, u] * (1.0 - fx) + gray[v, u + 1] * fx
     low = gray[v + 1, u] * (1.0 - fx) + gray[v + 1, u + 1] * fx
-    return top * (1.0 - fy) + low * fy
+    return float(top * (1.0 - fy) + low * fy)
 
 
 @jit
 def expected_reach(
-    c: Cap, rays: Any, focal: float, x: float, y: float, radius: float, turn: Floats
+    c: Cap, rays: NDArray[np.float32], focal: float, x: float, y: float, radius: float, turn: Floats
 ) -> float:
     """Return how far from (x, y), px, the outline of a cap lies in the direction turn (2,)."""
     reach = radius
@@ -72,14 +70,21 @@ def steepest(profile: Floats, count: int, sign: float) -> tuple[float, float]:
 
 @jit
 def sample_outline(
-    gray: NDArray[np.float32], image: Any, rank: int, cap: Floats, circle: Floats, focal: float,
+    gray: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    ranks: NDArray[np.int32],
+    rank: int,
+    cap: Floats,
+    circle: Floats,
+    focal: float,
     out: Floats,
-) -> int:  # fmt: skip
+) -> int:
     """Find the outline of a cap in the colour image, in 32 directions.
 
     Args:
         gray: (H, W) luma, 0..1.
-        image: Depth, scale, rays (H, W, 2), and ranks (H, W) of the nearest circle per pixel.
+        rays: (H, W, 2) rays at z = 1.
+        ranks: (H, W) rank of the nearest circle per pixel.
         rank: This circle's; a place that a nearer one covers is left out.
         cap: (15,) the estimate.
         circle: (3,) x, y, radius, px.
@@ -89,7 +94,6 @@ def sample_outline(
     Returns:
         Number of rays.
     """
-    rays, ranks = image[2], image[3]
     c = frozen(cap)
     profiles = np.empty((DIRECTIONS, 2 * REACH + 1))
     reaches = np.zeros(DIRECTIONS)

@@ -1,7 +1,7 @@
 """What a depth image says about each cap: points on a grid inside its circle, and its depth edge.
 
-Kernels work on the sensor's native depth, 0 = missing, and on the rays of all pixels; they assume
-finite numbers.
+Kernels work on depth in metres, 0 = missing, and on the rays of all pixels; they assume finite
+numbers.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def paint(ranks: NDArray[np.int32], circles: Floats, order: NDArray[np.int64]) -
 
 @jit
 def block(
-    depth: NDArray[Any],
+    depth: NDArray[np.float32],
     rays: NDArray[np.float32],
     ranks: NDArray[np.int32],
     rank: int,
@@ -61,12 +61,12 @@ def block(
     """Average the valid pixels of a square block.
 
     Args:
-        depth: (H, W) native, 0 = missing.
+        depth: (H, W) m, 0 = missing.
         rays: (H, W, 2) x and y of each pixel's ray at z = 1; beyond 1e3 where it has none.
         ranks: (H, W) rank of the nearest circle that covers the pixel.
         rank: This circle's; pixels of a lower one are hidden.
         place: u, v, half width of the block, px.
-        out: (4,) out: mean x and y of the rays, mean depth and its variance, native.
+        out: (4,) out: mean x and y of the rays, mean depth (m) and its variance.
 
     Returns:
         How many pixels were valid.
@@ -95,7 +95,7 @@ def block(
 
 @jit
 def middle_depth(points: Floats, count: NDArray[np.int64], half: int) -> float:
-    """Return the median native depth of the blocks near the centre, 0 without any."""
+    """Return the median depth (m) of the blocks near the centre, 0 without any."""
     values = np.empty(len(points))
     n = 0
     for j in range(len(points)):
@@ -118,7 +118,7 @@ def sample_depth(
     """Take the points of a cap: block means on a grid inside its circle, gated around its depth.
 
     Args:
-        image: Native depth (H, W), metres per unit, rays (H, W, 2) and ranks (H, W) as in `block`.
+        image: Depth (H, W), rays (H, W, 2) and ranks (H, W) as in `block`.
         rank: This circle's.
         circle: (3,) x, y, radius, px.
         focal: Focal length, px.
@@ -128,7 +128,7 @@ def sample_depth(
     Returns:
         Number of points, and the cap's middle depth (m), 0 where there is none.
     """
-    depth, scale, rays, ranks = image
+    depth, rays, ranks = image
     radius = circle[2]
     half = max(0, int(np.floor(radius / GRID)))
     full = (2 * half + 1) ** 2
@@ -138,16 +138,16 @@ def sample_depth(
         u = int(np.floor(circle[0] + radius * CELLS[j, 0] + 0.5))
         v = int(np.floor(circle[1] + radius * CELLS[j, 1] + 0.5))
         count[j] = block(depth, rays, ranks, rank, (u, v, half), points[j])
-    middle = middle_depth(points, count, half) * scale
+    middle = middle_depth(points, count, half)
     if middle <= 0.0:
         return 0, 0.0
     size = radius * middle / focal
     n = 0
     for j in range(len(CELLS)):
-        z = points[j, 2] * scale
+        z = points[j, 2]
         sigma = noise[0] + noise[1] * z
         even = (2.5 * sigma) ** 2 + (0.6 * size * (2 * half + 1) / radius) ** 2
-        if count[j] <= 0.4 * full or points[j, 3] * scale * scale > even:
+        if count[j] <= 0.4 * full or points[j, 3] > even:
             continue
         if not middle - 0.8 * size < z < middle + size:
             continue
@@ -161,7 +161,7 @@ def sample_depth(
 
 @jit
 def edge_along(
-    depth: NDArray[Any],
+    depth: NDArray[np.float32],
     ranks: NDArray[np.int32],
     rank: int,
     line: tuple[float, float, float, float],
@@ -174,11 +174,11 @@ def edge_along(
     where something deeper follows within 4 steps, for there the cap ends and is not merely hidden.
 
     Args:
-        depth: (H, W) native, 0 = missing.
+        depth: (H, W) m, 0 = missing.
         ranks: (H, W) as in `block`.
         rank: This circle's.
         line: x, y of the first step and of a step, px.
-        gate: Depths of the cap, native.
+        gate: Depths of the cap, m.
     """
     height, width = depth.shape
     best, edge, total, follows = 0.0, -1, 0.0, 0
@@ -231,10 +231,10 @@ def sample_edges(
     Returns:
         Number of trusted edge rays.
     """
-    depth, scale, rays, ranks = image
+    depth, rays, ranks = image
     x, y, radius = circle[0], circle[1], circle[2]
     size = radius * middle / focal
-    gate = ((middle - 0.8 * size) / scale, (middle + 0.95 * size) / scale)
+    gate = (middle - 0.8 * size, middle + 0.95 * size)
     step = radius * (OUTER - INNER) / (RADII - 1)
     n = 0
     for j in range(DIRECTIONS):

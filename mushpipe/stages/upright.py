@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,7 +13,7 @@ _SAMPLES = (CELL // STRIDE) ** 2
 
 
 @jit
-def far_points(depth: NDArray[Any], scale: float, rays: NDArray[np.float32], out: Floats) -> int:
+def far_points(depth: NDArray[np.float32], rays: NDArray[np.float32], out: Floats) -> int:
     """Fill (M, 3) with the ray (x, y at z = 1) and the 90th percentile of depth of each cell."""
     values = np.empty(_SAMPLES)
     n = 0
@@ -25,7 +23,7 @@ def far_points(depth: NDArray[Any], scale: float, rays: NDArray[np.float32], out
             for v in range(v0, v0 + CELL, STRIDE):
                 for u in range(u0, u0 + CELL, STRIDE):
                     if depth[v, u] > 0 and rays[v, u, 0] < 1e3:
-                        values[count] = depth[v, u] * scale
+                        values[count] = depth[v, u]
                         count += 1
             if count > 0.3 * _SAMPLES:
                 middle = rays[v0 + CELL // 2, u0 + CELL // 2]
@@ -36,7 +34,7 @@ def far_points(depth: NDArray[Any], scale: float, rays: NDArray[np.float32], out
 
 
 def bed_normal(
-    depth: NDArray[Any], scale: float, rays: NDArray[np.float32], rough: float = 0.003
+    depth: NDArray[np.float32], rays: NDArray[np.float32], rough: float = 0.003
 ) -> Floats | None:
     """Fit a plane to the bed and return its unit normal (3,), towards the camera.
 
@@ -45,8 +43,7 @@ def bed_normal(
     than what lies below it.
 
     Args:
-        depth: (H, W) native, 0 = missing.
-        scale: Metres per unit.
+        depth: (H, W) m, 0 = missing.
         rays: (H, W, 2) rays at z = 1.
         rough: Roughness of the bed, m.
 
@@ -54,7 +51,7 @@ def bed_normal(
         None where there is too little depth.
     """
     cells = np.empty(((depth.shape[0] // CELL) * (depth.shape[1] // CELL), 3))
-    points = cells[: far_points(depth, scale, rays, cells)]
+    points = cells[: far_points(depth, rays, cells)]
     if len(points) < 12:
         return None
     basis, inverse = np.insert(points[:, :2], 2, 1.0, axis=1), 1 / points[:, 2]
