@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, PrivateAttr
+from pydantic import Field
 
 from mushpipe import (
     Camera,
@@ -21,7 +19,7 @@ from mushpipe import (
 )
 from mushpipe.stages.cap_batch import Fits, fit_caps
 from mushpipe.stages.cap_solve import Noise
-from mushpipe.stages.upright import bed_normal
+from mushpipe.stages.upright import Up, pixel_rays, upright
 
 Floats = NDArray[np.float64]
 
@@ -35,10 +33,7 @@ class CapFit(Stage):
     ``missing`` and has no pose.
     """
 
-    up: Literal["bed", "camera"] | tuple[float, float, float] = Field(
-        "bed",
-        description="the upright: the bed's normal, towards the camera, or a vector in its frame",
-    )
+    up: Up = "bed"
     tilt_deg: float = Field(
         25, gt=0, le=90, description="spread of the tilt off the upright, degrees"
     )
@@ -55,8 +50,6 @@ class CapFit(Stage):
         1, gt=0, description="sigma of the outline in the colour image, alignment included, px"
     )
     min_points: int = Field(8, ge=6, le=97, description="fewest of 97 points a fit needs")
-
-    _rays: tuple[Camera, NDArray[np.float32]] | None = PrivateAttr(None)
 
     def open(self) -> None:
         """Compile the kernels."""
@@ -100,7 +93,7 @@ class CapFit(Stage):
             camera: Intrinsics.
             circles: Outlines, px.
         """
-        rays = self._rays_of(camera)
+        rays = pixel_rays(camera)
         noise = Noise(
             shape=0.0006,
             outline=0.03,
@@ -123,24 +116,9 @@ class CapFit(Stage):
         return fit_caps(
             (gray, (depth, rays), (camera.fx + camera.fy) / 2),
             np.column_stack([circles.center, circles.radius]),
-            (self._upright(depth, rays), float(np.radians(self.tilt_deg))),
+            (upright(self.up, depth, rays), float(np.radians(self.tilt_deg))),
             (noise, sensor, self.min_points),
         )
-
-    def _rays_of(self, camera: Camera) -> NDArray[np.float32]:
-        """Return the rays (H, W, 2) at z = 1; far beyond any image where the lens has none."""
-        if self._rays is None or self._rays[0] != camera:
-            v, u = np.mgrid[: camera.height, : camera.width]
-            points = camera.deproject(np.stack([u, v], axis=-1), np.ones(u.shape))[..., :2]
-            self._rays = camera, np.nan_to_num(points, nan=1e6).astype(np.float32)
-        return self._rays[1]
-
-    def _upright(self, depth: NDArray[np.float32], rays: NDArray[np.float32]) -> Floats:
-        if isinstance(self.up, tuple):
-            vector = np.array(self.up)
-            return np.asarray(vector / np.linalg.norm(vector))
-        normal = bed_normal(depth, rays) if self.up == "bed" else None
-        return np.array([0.0, 0.0, -1.0]) if normal is None else normal
 
 
 def _locations(fits: Fits, circles: Circles, depth: NDArray[np.float32]) -> Locations:

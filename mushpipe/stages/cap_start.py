@@ -12,8 +12,8 @@ ASPECT = 0.62
 GAIN = 1 / (1 - ASPECT**2)
 STEEPEST = 0.9  # rad off the line of sight at which a fit may start
 DEGREES = 4.0  # of freedom of Student's t: how readily a leaning cap is let go
-PRIOR_CAPS = 4.0  # the spread that is set counts as much as so many caps
-NARROWEST = np.radians(3.0)
+PRIOR_CAPS = 1.0  # the spread that is set counts as much as so many caps
+NARROWEST = np.radians(2.0)
 
 
 @jit

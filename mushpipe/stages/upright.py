@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+from typing import Annotated, Literal
+
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
+from mushpipe import Camera
 from mushpipe.core.jit import jit
 
 Floats = NDArray[np.float64]
+Up = Annotated[
+    Literal["bed", "camera"] | tuple[float, float, float],
+    Field(
+        description="the upright: the bed's normal, towards the camera, or a vector in its frame"
+    ),
+]
 CELL, STRIDE = 32, 8
 _SAMPLES = (CELL // STRIDE) ** 2
 
@@ -64,3 +75,27 @@ def bed_normal(
         spread = max(1.0, 1.5 * float(np.median(np.abs(scaled))))
         weight = np.maximum(0, 1 - (scaled / spread) ** 2) ** 2 + 1e-6
     return np.asarray(-plane / np.linalg.norm(plane))
+
+
+@lru_cache(maxsize=4)
+def pixel_rays(camera: Camera) -> NDArray[np.float32]:
+    """Return the rays (H, W, 2) of all pixels at z = 1; beyond 1e3 where the lens has none."""
+    v, u = np.mgrid[: camera.height, : camera.width]
+    points = camera.deproject(np.stack([u, v], axis=-1), np.ones(u.shape))[..., :2]
+    rays = np.nan_to_num(points, nan=1e6).astype(np.float32)
+    rays.flags.writeable = False
+    return rays
+
+
+def upright(up: Up, depth: NDArray[np.float32], rays: NDArray[np.float32]) -> Floats:
+    """Return which way is up, a unit vector (3,) in the optical frame.
+
+    Args:
+        up: A setting; where the bed has too little depth, towards the camera.
+        depth: (H, W) m, 0 = missing.
+        rays: (H, W, 2) rays at z = 1.
+    """
+    if isinstance(up, tuple):
+        return np.asarray(up / np.linalg.norm(up))
+    normal = bed_normal(depth, rays) if up == "bed" else None
+    return np.array([0.0, 0.0, -1.0]) if normal is None else normal
