@@ -13,6 +13,8 @@ def mushpipe_register(registry: Registry) -> None:
     registry.stage("opening", "mushpipe.stages.opening:Opening")
     registry.stage("hough", "mushpipe.stages.hough:Hough")
     registry.stage("nearest-depth", "mushpipe.stages.nearest_depth:NearestDepth")
+    registry.stage("depth-correct", "mushpipe.stages.depth_correct:DepthCorrect")
+    registry.stage("fuse-depth", "mushpipe.stages.fuse_depth:FuseDepth")
     registry.stage("cap-fit", "mushpipe.stages.cap_fit:CapFit")
     registry.stage("registration", "mushpipe.stages.registration:Registration")
     registry.stage("picks", "mushpipe.stages.picks:MakePicks")

@@ -30,7 +30,7 @@ class Registration(Stage):
 
     As in the paper: voxel downsampling, normals, FPFH features, Fast Global Registration, then
     ICP; the pose is the turn that takes the upright model to the mushroom, without its spin. The
-    tilt's sigma is unknown. `cap-fit` is better and a thousand times faster; this is for comparison.
+    tilt's sigma is unknown. `cap-fit` is better and far faster; this is for comparison.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -46,6 +46,9 @@ class Registration(Stage):
     )
     voxel: float = Field(0.12, gt=0.01, le=1, description="voxel, in radii of the cap")
     up: Up = "bed"
+    steepest_deg: float = Field(
+        60, gt=0, le=180, description="a global registration that leans more has failed, degrees"
+    )
     min_points: int = Field(30, ge=10, description="fewest points of a mushroom, after thinning")
 
     _model: Any = PrivateAttr(None)
@@ -78,22 +81,29 @@ class Registration(Stage):
         if frame.depth is not None and n:
             if frame.camera is None:
                 raise InputError("depth cannot be turned into metres without the calibration")
-            # seeds RANSAC and the tuple test of FGR
-            import_open3d().utility.random.seed(int(rng.integers(2**31)))
+            o3d = import_open3d()
+            # seeds RANSAC and the tuple test of FGR; ICP and FPFH draw nothing
+            o3d.utility.random.seed(int(rng.integers(2**31)))
             depth = np.fmax(frame.depth_m, np.float32(0))
             rays = pixel_rays(frame.camera)
             up, focal = upright(self.up, depth, rays), (frame.camera.fx + frame.camera.fy) / 2
-            for i in np.flatnonzero(np.isfinite(locations.distance)):
-                size = circles.radius[i] * locations.position[i, 2] / focal
-                points = _inside(depth, rays, circles.center[i], circles.radius[i], size)
-                center = locations.position[i] * (
-                    1 + self._model.top * size / locations.distance[i]
-                )
-                found = self.register(points, center, size, up)
-                if found is not None:
-                    axis[i], apex[i], fitness[i] = found
+            view = (depth, rays, up, focal)
+            with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+                for i in np.flatnonzero(np.isfinite(locations.distance)):
+                    found = self._pose(view, circles, locations, int(i))
+                    if found is not None:
+                        axis[i], apex[i], fitness[i] = found
         valid = np.isfinite(axis).all(axis=1)
         return Poses(quaternion_from_axis(axis), axis, apex, np.full(n, np.nan), fitness, valid)
+
+    def _pose(
+        self, view: Any, circles: Circles, locations: Locations, i: int
+    ) -> tuple[Floats, Floats, float] | None:
+        depth, rays, up, focal = view
+        size = circles.radius[i] * locations.position[i, 2] / focal
+        points = _inside(depth, rays, circles.center[i], circles.radius[i], size)
+        deeper = 1 + self._model.top * size / locations.distance[i]
+        return self.register(points, locations.position[i] * deeper, size, up)
 
     def register(
         self, points: Floats, center: Floats, size: float, up: Floats
@@ -120,7 +130,10 @@ class Registration(Stage):
             return None
         self._orient(o3d, target, -center / size)
         source = _cloud(o3d, model.points @ turn.T, model.normals @ turn.T)
-        result = self._refine(o3d, source, target, self._start(o3d, source, target))
+        start = self._start(o3d, source, target)
+        if up @ start[:3, :3] @ up < np.cos(np.radians(self.steepest_deg)):
+            start = np.eye(4)  # a smooth cap fits upside down as well
+        result = self._refine(o3d, source, target, start)
         total = np.asarray(result.transformation)
         axis = total[:3, :3] @ turn @ model.axis
         apex = total[:3, :3] @ (turn @ (model.top * model.axis)) + total[:3, 3]
@@ -163,7 +176,7 @@ class Registration(Stage):
             )
         else:
             estimation = registration.TransformationEstimationPointToPoint()
-        criteria = registration.ICPConvergenceCriteria(max_iteration=60)
+        criteria = registration.ICPConvergenceCriteria(max_iteration=200)
         return registration.registration_icp(
             source, target, 3 * self.voxel, start, estimation, criteria
         )

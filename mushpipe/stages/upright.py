@@ -96,6 +96,7 @@ def upright(up: Up, depth: NDArray[np.float32], rays: NDArray[np.float32]) -> Fl
         rays: (H, W, 2) rays at z = 1.
     """
     if isinstance(up, tuple):
-        return np.asarray(up / np.linalg.norm(up))
+        vector = np.array(up)
+        return np.asarray(vector / np.linalg.norm(vector))
     normal = bed_normal(depth, rays) if up == "bed" else None
     return np.array([0.0, 0.0, -1.0]) if normal is None else normal

@@ -56,7 +56,8 @@ def _revolved(rho: Floats, z: Floats, spacing: float) -> tuple[Floats, Floats]:
     radius, height = np.interp(at, length, rho), np.interp(at, length, z)
     d_rho = np.interp(at, length, np.gradient(rho, length + np.arange(len(length)) * 1e-12))
     d_z = np.interp(at, length, np.gradient(z, length + np.arange(len(length)) * 1e-12))
-    points, normals = [], []
+    points: list[Floats] = []
+    normals: list[Floats] = []
     for r, h, dr, dz in zip(radius, height, d_rho, d_z, strict=True):
         count = max(1, round(2 * np.pi * r / spacing))
         turn = (np.arange(count) + 0.5 * (len(points) % 2)) * (2 * np.pi / count)
@@ -94,7 +95,7 @@ def read(path: Path, spacing: float) -> Model:
     thin = thin.voxel_down_sample(spacing)
     thin.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(3 * spacing, 30))
     points, normals = np.asarray(thin.points), np.asarray(thin.normals)
-    inwards = (normals * (points + [0, 0, 0.3])).sum(axis=1) < 0
+    inwards = (normals * (points + np.array([0, 0, 0.3]))).sum(axis=1) < 0
     cap = points[points[:, 2] > 0]
     axis = np.linalg.svd(cap - cap.mean(axis=0))[2][2]
     normals = np.where(inwards[:, None], -normals, normals)
