@@ -78,9 +78,8 @@ def main() -> None:
     times["registration"] = milliseconds(lambda: register.process(frame, few, where, rng), 3)
     for name, (wall, cpu) in times.items():
         n = len(few) if name == "registration" else len(circles)
-        print(
-            f"{name:14s} {wall:8.2f} ms wall, {cpu:8.2f} ms CPU for {n}; {cpu / n * 1000:9.1f} us each"
-        )
+        each = f"{cpu / n * 1000:9.1f} us each"
+        print(f"{name:14s} {wall:8.2f} ms wall, {cpu:8.2f} ms CPU for {n}; {each}")
     ratio = times["registration"][1] / len(few) / (times["cap-fit"][1] / len(circles))
     print(f"registration costs {ratio:.0f} times as much CPU per mushroom as cap-fit")
 

@@ -17,10 +17,10 @@ from pose_scenes import SETS, circles_in, frames, truth_of
 
 from mushpipe import Circles, Locations, Poses, RgbdFrame
 from mushpipe.stages.cap_fit import CapFit
+from mushpipe.stages.depth_correct import DepthCorrect
 from mushpipe.stages.fuse_depth import FuseDepth
 from mushpipe.stages.nearest_depth import NearestDepth
 from mushpipe.stages.registration import Registration
-from mushpipe.stages.depth_correct import DepthCorrect
 from mushpipe.stages.upright import pixel_rays, upright
 
 EXACT = {

@@ -51,7 +51,7 @@ def frames(scene: dict[str, Any], seed: int, family: str, count: int, cache: Pat
 def truth_of(frame: RgbdFrame) -> Truth:
     """Return the truth of a simulated frame."""
     truth = frame.attached[TRUTH_TOPIC]
-    assert isinstance(truth, Truth)  # noqa: S101
+    assert isinstance(truth, Truth)
     return truth
 
 
