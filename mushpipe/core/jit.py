@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -32,7 +33,8 @@ def _cache_folder() -> Path:
         folder = Path.home() / ".cache" / "mushpipe"
     folder = folder / f"kernels-{digest.hexdigest()[:12]}"
     for old in folder.parent.glob("kernels-*"):
-        if old != folder:
+        # a younger one may be another process's, started before the source changed
+        if old != folder and old.stat().st_mtime < time.time() - 86_400:
             shutil.rmtree(old, ignore_errors=True)
     return folder
 
