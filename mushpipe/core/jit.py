@@ -2,20 +2,61 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
+import shutil
+import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
+import numba
 from numba import njit
 
 F = TypeVar("F", bound=Callable[..., Any])
+_FAST = {"reassoc", "contract", "arcp", "nsz"}
+
+
+def _cache_folder() -> Path:
+    """Return a folder for compiled kernels that is new whenever the source of any kernel is.
+
+    numba looks only at the file of the kernel that is called: change one that it calls, in another
+    file, and the old code goes on running.
+    """
+    package = Path(__file__).parents[1]
+    digest = hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        text = path.read_bytes()
+        if b"core.jit" in text or path == Path(__file__):
+            digest.update(text)
+    folder = package / "__pycache__"
+    if not os.access(folder if folder.exists() else package, os.W_OK):
+        folder = Path.home() / ".cache" / "mushpipe"
+    folder = folder / f"kernels-{digest.hexdigest()[:12]}"
+    for old in folder.parent.glob("kernels-*"):
+        # a younger one may be another process's, started before the source changed
+        if old != folder and old.stat().st_mtime < time.time() - 86_400:
+            shutil.rmtree(old, ignore_errors=True)
+    return folder
+
+
+if not os.environ.get("NUMBA_CACHE_DIR"):
+    numba.config.CACHE_DIR = str(_cache_folder())  # type: ignore[attr-defined]
 
 
 def jit(function: F) -> F:
-    """Compile a kernel on first use; on a machine without a writable cache, in every process."""
+    """Compile a kernel on first use; on a machine without a writable cache, in every process.
+
+    Sums may be reordered, but NaN and infinity keep their meaning: missing depth is NaN. Division
+    by zero gives infinity and does not raise.
+    """
     try:
-        return cast(
-            F,
-            njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp", "nsz"})(function),
-        )
+        kernel = njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")(function)
     except RuntimeError:  # numba found no folder it may write to
-        return cast(F, njit(nogil=True, fastmath={"reassoc", "contract", "arcp", "nsz"})(function))
+        kernel = njit(nogil=True, fastmath=_FAST, error_model="numpy")(function)
+    return cast(F, kernel)
+
+
+def inlined(function: F) -> F:
+    """Make a part of kernels that is copied into them, so that loops around it use SIMD."""
+    return cast(F, njit(inline="always", fastmath=_FAST, error_model="numpy")(function))

@@ -6,9 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mushpipe import Camera, Circles, DepthSource, InputError, Locations, RgbdFrame, Stage
+from mushpipe import Circles, DepthSource, InputError, Locations, RgbdFrame, Stage
+from mushpipe.core.jit import jit
 
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 
 
 class NearestDepth(Stage):
@@ -22,6 +24,13 @@ class NearestDepth(Stage):
     """
 
     neighbours: int = Field(4, ge=1, description="how many nearest points stand in for a missing")
+
+    def open(self) -> None:
+        """Compile the kernels."""
+        depth = np.zeros((2, 2), np.float32)
+        depth.flags.writeable = False
+        nearest(depth, np.zeros((1, 3)), 1, np.empty((1, 1, 3)))
+        ends(depth, np.zeros((1, 3)), np.empty((1, 4)))
 
     def process(self, frame: RgbdFrame, circles: Circles) -> Locations:
         """Return one location per circle.
@@ -38,10 +47,29 @@ class NearestDepth(Stage):
                     "depth cannot be turned into metres without the camera's calibration: record "
                     "camera_info, or set source.camera: {fx: , fy: , cx: , cy: }"
                 )
-            for i, (center, radius) in enumerate(zip(circles.center, circles.radius, strict=True)):
-                cap = _Cap(frame.depth_m, frame.camera, center, float(radius))
-                position[i], source[i] = cap.locate(self.neighbours)
-                diameter[i] = cap.diameter()
+            depth = np.fmax(frame.depth_m, np.float32(0))  # missing: 0 in place of NaN
+            depth.flags.writeable = False
+            discs = np.column_stack([circles.center, circles.radius])
+            pixels = np.full((n, self.neighbours, 3), np.nan)
+            found = nearest(depth, discs, self.neighbours, pixels)
+            points = frame.camera.deproject(pixels[..., :2], pixels[..., 2])
+            off = np.abs(pixels[:, 0, :2] - circles.center).max(axis=1)
+            # The centre pixel is the one the centre rounds to.
+            measured = (found > 0) & (off <= 0.5)
+            points[measured, 1:] = np.nan
+            some = found > 0
+            position[some] = np.nanmean(points[some], axis=1)
+            source[some] = DepthSource.NEIGHBOURS
+            source[measured] = DepthSource.MEASURED
+            rim = np.full((n, 4), np.nan)
+            ends(depth, discs, rim)
+            corners = circles.center[:, None] + circles.radius[:, None, None] * _SIDES
+            rims = frame.camera.deproject(corners, rim)
+            spans = np.linalg.norm(rims[:, 1::2] - rims[:, ::2], axis=2)
+            known = np.isfinite(spans)
+            count = np.maximum(known.sum(axis=1), 1)
+            diameter = np.where(known, spans, 0).sum(axis=1) / count
+            diameter[~known.any(axis=1)] = np.nan
         return Locations(
             position=position,
             distance=np.linalg.norm(position, axis=1),
@@ -52,56 +80,80 @@ class NearestDepth(Stage):
         )
 
 
-class _Cap:
-    """The valid depth pixels inside one circle, as pixels (M, 2) and points (M, 3)."""
+_SIDES = np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
 
-    def __init__(
-        self, depth_m: NDArray[np.float32], camera: Camera, center: Floats, radius: float
-    ) -> None:
-        self.camera = camera
-        self.center = center
-        self.radius = radius
-        height, width = depth_m.shape
-        (left, top), (right, bottom) = (
-            np.clip(np.floor(center - radius), 0, (width, height)).astype(int),
-            np.clip(np.ceil(center + radius) + 1, 0, (width, height)).astype(int),
-        )
-        v, u = np.mgrid[top:bottom, left:right]
-        offset = np.stack([u - center[0], v - center[1]], axis=-1)
-        patch = depth_m[top:bottom, left:right]
-        valid = np.isfinite(patch) & ((offset**2).sum(axis=-1) <= radius**2)
-        self.offset: Floats = offset[valid].astype(np.float64)
-        self.points = camera.deproject(self.offset + center, patch[valid].astype(np.float64))
 
-    def locate(self, neighbours: int) -> tuple[Floats, DepthSource]:
-        """Return the point at the centre pixel, else the mean of the nearest valid points."""
-        if not len(self.points):
-            return np.full(3, np.nan), DepthSource.MISSING
-        squared = (self.offset**2).sum(axis=1)
-        nearest = np.argsort(squared, kind="stable")
-        # The centre pixel is the one the centre rounds to.
-        if np.all(np.abs(self.offset[nearest[0]]) <= 0.5):
-            return self.points[nearest[0]], DepthSource.MEASURED
-        return self.points[nearest[:neighbours]].mean(axis=0), DepthSource.NEIGHBOURS
+@jit
+def box(depth: Singles, disc: Floats) -> tuple[int, int, int, int]:
+    """Return top, bottom, left, right of the pixels around a circle (x, y, r) in the image."""
+    height, width = depth.shape
+    top, left = np.floor(disc[1] - disc[2]), np.floor(disc[0] - disc[2])
+    bottom, right = np.ceil(disc[1] + disc[2]) + 1, np.ceil(disc[0] + disc[2]) + 1
+    return (
+        int(min(max(top, 0), height)),
+        int(min(max(bottom, 0), height)),
+        int(min(max(left, 0), width)),
+        int(min(max(right, 0), width)),
+    )
 
-    def diameter(self) -> float:
-        """Return the mean of the row's and the column's diameter; NaN where neither is known."""
-        spans = [self._span(axis) for axis in (0, 1)]
-        known = [span for span in spans if np.isfinite(span)]
-        return float(np.mean(known)) if known else np.nan
 
-    def _span(self, axis: int) -> float:
-        """Return the distance of the opposite points along one image axis."""
-        ends = [self._end(axis, sign) for sign in (-1, 1)]
-        return float(np.linalg.norm(ends[1] - ends[0]))
+@jit
+def nearest(depth: Singles, discs: Floats, most: int, out: Floats) -> NDArray[np.int64]:
+    """Find the valid pixels next to each circle's centre, inside it.
 
-    def _end(self, axis: int, sign: int) -> Floats:
-        """Return the circle's end point on one side at the nearest depth found on that side."""
-        end = np.zeros(2)
-        end[axis] = sign * self.radius
-        side = np.flatnonzero(self.offset[:, axis] * sign > 0)
-        if not len(side):
-            return np.full(3, np.nan)
-        squared = ((self.offset[side] - end) ** 2).sum(axis=1)
-        z = self.points[side[np.argmin(squared)], 2]
-        return self.camera.deproject(self.center + end, z)
+    Args:
+        depth: (H, W) m, 0 = missing.
+        discs: (N, 3) x, y, radius, px.
+        most: How many pixels are wanted.
+        out: (N, most, 3) out: x, y, depth (m), the nearest first; the rest stays as it is.
+
+    Returns:
+        (N,) how many were found.
+    """
+    counts = np.zeros(len(discs), np.int64)
+    best = np.empty(most)
+    for i in range(len(discs)):
+        top, bottom, left, right = box(depth, discs[i])
+        n = 0
+        for v in range(top, bottom):
+            for u in range(left, right):
+                square = (u - discs[i, 0]) ** 2 + (v - discs[i, 1]) ** 2
+                if depth[v, u] <= 0 or square > discs[i, 2] ** 2:
+                    continue
+                if n == most and square >= best[n - 1]:
+                    continue
+                k = min(n, most - 1)
+                while k > 0 and best[k - 1] > square:
+                    best[k] = best[k - 1]
+                    out[i, k] = out[i, k - 1]
+                    k -= 1
+                best[k] = square
+                out[i, k, 0], out[i, k, 1], out[i, k, 2] = u, v, depth[v, u]
+                n = min(n + 1, most)
+        counts[i] = n
+    return counts
+
+
+@jit
+def ends(depth: Singles, discs: Floats, out: Floats) -> None:
+    """Find the depth (N, 4) nearest to the left, right, upper and lower end of each circle.
+
+    Only pixels inside the circle and on the end's own side of the centre count; without any the
+    value stays as it is.
+    """
+    for i in range(len(discs)):
+        x, y, r = discs[i, 0], discs[i, 1], discs[i, 2]
+        top, bottom, left, right = box(depth, discs[i])
+        best = np.full(4, 1e30)
+        for v in range(top, bottom):
+            for u in range(left, right):
+                dx, dy = u - x, v - y
+                if depth[v, u] <= 0 or dx * dx + dy * dy > r * r:
+                    continue
+                for side in range(4):
+                    along, across = (dx, dy) if side < 2 else (dy, dx)
+                    along = -along if side % 2 == 0 else along
+                    square = (along - r) ** 2 + across * across
+                    if along > 0 and square < best[side]:
+                        best[side] = square
+                        out[i, side] = depth[v, u]

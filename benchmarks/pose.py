@@ -1,0 +1,88 @@
+"""Time of the pose stages on a bed of 150 mushrooms, one thread.
+
+OMP_NUM_THREADS=1 python benchmarks/pose.py
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numba
+import numpy as np
+from pose_scenes import circles_in, frames, truth_of
+
+from mushpipe import Circles
+from mushpipe.core.libraries import import_open3d
+from mushpipe.stages.cap_fit import CapFit
+from mushpipe.stages.depth_correct import DepthCorrect
+from mushpipe.stages.fuse_depth import FuseDepth
+from mushpipe.stages.nearest_depth import NearestDepth
+from mushpipe.stages.registration import Registration
+
+SCENE = {"distance": 0.65, "size_mm": (20, 50), "tilt_deg": (0, 25), "count": 240, "cluster": 0.5}
+SEED = 7
+
+
+def milliseconds(call: Callable[[], object], repeats: int) -> tuple[float, float]:
+    """Return median wall and CPU time, ms."""
+    call()
+    wall, cpu = [], []
+    for _ in range(repeats):
+        w, c = time.perf_counter(), time.process_time()
+        call()
+        wall.append(time.perf_counter() - w)
+        cpu.append(time.process_time() - c)
+    return 1000 * float(np.median(wall)), 1000 * float(np.median(cpu))
+
+
+def main() -> None:
+    """Print the times."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=150)
+    parser.add_argument("--repeats", type=int, default=50)
+    parser.add_argument("--registrations", type=int, default=12, help="mushrooms to register")
+    parser.add_argument("--cache", type=Path, help="folder that keeps rendered frames")
+    options = parser.parse_args()
+    frame = frames(SCENE, SEED, "a", 1, options.cache)[0]
+    found, _ = circles_in(truth_of(frame), SEED, False)
+    rows = np.argsort(-found.radius, kind="stable")[: options.count]
+    circles = Circles(found.center[rows], found.radius[rows], found.score[rows])
+    fit, nearest, register = CapFit(depth_bias_mm=2.85), NearestDepth(), Registration()
+    for stage in (fit, nearest, register):
+        stage.open()
+    frame.gray, frame.depth_m  # noqa: B018 - shared by all stages of a graph
+    print(
+        f"{len(circles)} circles, median radius {np.median(circles.radius):.1f} px, seed {SEED}; "
+        f"Python {platform.python_version()}, numba {numba.__version__}, "
+        f"open3d {import_open3d().__version__}, OMP_NUM_THREADS={os.environ.get('OMP_NUM_THREADS')}"
+    )
+    fuse = FuseDepth()
+    fuse.open()
+    calls: dict[str, Callable[[], object]] = {
+        "cap-fit": lambda: fit.process(frame, circles),
+        "nearest-depth": lambda: nearest.process(frame, circles),
+        "fuse-depth": lambda: fuse.process(frame),
+        "depth-correct": lambda: DepthCorrect(offset_mm=2.85).process(frame),
+    }
+    times = {name: milliseconds(call, options.repeats) for name, call in calls.items()}
+    few = Circles(
+        *(a[: options.registrations] for a in (circles.center, circles.radius, circles.score))
+    )
+    where = nearest.process(frame, few)
+    rng = np.random.default_rng(0)
+    times["registration"] = milliseconds(lambda: register.process(frame, few, where, rng), 3)
+    for name, (wall, cpu) in times.items():
+        n = len(few) if name == "registration" else len(circles)
+        each = f"{cpu / n * 1000:9.1f} us each"
+        print(f"{name:14s} {wall:8.2f} ms wall, {cpu:8.2f} ms CPU for {n}; {each}")
+    ratio = times["registration"][1] / len(few) / (times["cap-fit"][1] / len(circles))
+    print(f"registration costs {ratio:.0f} times as much CPU per mushroom as cap-fit")
+
+
+if __name__ == "__main__":
+    main()

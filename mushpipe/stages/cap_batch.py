@@ -1,0 +1,290 @@
+"""All caps of a frame: sampling, fitting, and what follows from the fitted parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mushpipe.core.jit import jit
+from mushpipe.stages.cap_model import (
+    HEIGHT,
+    RADIUS,
+    SIZE,
+    UNKNOWNS,
+    Floats,
+    N,
+    Vector,
+    frozen,
+    meet,
+    slope,
+)
+from mushpipe.stages.cap_outline import sample_outline
+from mushpipe.stages.cap_samples import (
+    CELLS,
+    COMPASS,
+    DIRECTIONS,
+    paint,
+    ray_at,
+    sample_depth,
+    sample_edges,
+)
+from mushpipe.stages.cap_solve import ROUND, Noise, refine, tilt, uncertainty, workspace
+from mushpipe.stages.cap_start import spread_of, start
+
+
+@dataclass(frozen=True, eq=False)
+class Fits:
+    """Fitted caps in the optical frame; NaN where not valid.
+
+    Attributes:
+        valid: (N,) whether there is a fit.
+        center: (N, 3) m, of the rim plane.
+        axis: (N, 3) unit, out of the cap.
+        radius: (N,) m, of the rim.
+        height: (N,) m, of the dome.
+        apex: (N, 3) m.
+        surface: (N, 3) m, where the ray of the circle's centre meets the cap.
+        covariance: (N, 8, 8) of centre, two turns of the axis, radius, height, bulge.
+        sigma_tilt: (N,) rad.
+        sigma_radius: (N,) m.
+        sigma_surface: (N, 3) m.
+        fitness: (N,) 0..1, mean robust weight of the points of the grid, 0 for a missing one.
+        edges: (N,) number of rays along the depth edge.
+        lines: (N,) number of rays along the outline in colour.
+    """
+
+    valid: NDArray[np.bool_]
+    center: Floats
+    axis: Floats
+    radius: Floats
+    height: Floats
+    apex: Floats
+    surface: Floats
+    covariance: Floats
+    sigma_tilt: Floats
+    sigma_radius: Floats
+    sigma_surface: Floats
+    fitness: Floats
+    edges: NDArray[np.int64]
+    lines: NDArray[np.int64]
+
+
+@jit
+def core_depth(depth: NDArray[np.float32], circle: Floats) -> float:
+    """Return the median depth (m) near the centre of a circle (x, y, r), 0 without any."""
+    values = np.empty(81)
+    n = 0
+    for i in range(-4, 5):
+        for j in range(-4, 5):
+            u = int(np.floor(circle[0] + 0.12 * i * circle[2] + 0.5))
+            v = int(np.floor(circle[1] + 0.12 * j * circle[2] + 0.5))
+            if 0 <= v < depth.shape[0] and 0 <= u < depth.shape[1] and depth[v, u] > 0:
+                values[n] = depth[v, u]
+                n += 1
+    return float(np.median(values[:n])) if n else 0.0
+
+
+@jit
+def rank_by_depth(
+    depth: NDArray[np.float32], circles: Floats, ranks: NDArray[np.int32]
+) -> NDArray[np.int64]:
+    """Return each circle's rank (N,), the nearest 0, and paint them over a `ranks` full of N."""
+    far = np.empty(len(circles))
+    for i in range(len(circles)):
+        far[i] = core_depth(depth, circles[i])
+        if far[i] <= 0.0:
+            far[i] = 1e30  # hides nothing
+    order = np.argsort(far)
+    paint(ranks, circles, order)
+    rank = np.empty(len(circles), np.int64)
+    for k in range(len(circles)):
+        rank[order[k]] = k
+    return rank
+
+
+@jit
+def gather(
+    image: Any,
+    circle: Floats,
+    rank: int,
+    focal: float,
+    sensor: tuple[float, float, float, float],
+    data: Any,
+) -> tuple[int, int, float]:
+    """Take the data of a cap; return numbers of points and edge rays, and its middle depth (m)."""
+    points, edges, around = data
+    n, middle = sample_depth(image, rank, circle, focal, (sensor[0], sensor[1]), points)
+    if n == 0:
+        return 0, 0, 0.0
+    m = sample_edges(image, rank, circle, focal, middle, sensor[3], edges)
+    for j in range(n):
+        points[3, j] -= sensor[2] / points[2, j]
+    for j in range(ROUND):
+        turn = COMPASS[j * (DIRECTIONS // ROUND)]
+        x, y = circle[0] + circle[2] * turn[0], circle[1] + circle[2] * turn[1]
+        around[0, j], around[1, j], around[2, j] = ray_at(image[1], focal, x, y)
+    return n, m, middle - sensor[2]
+
+
+@jit
+def first_fits(
+    frame: Any, circles: Floats, upright: tuple[Floats, float], settings: Any, data: Any, out: Any
+) -> None:
+    """Gather the data of every cap, and fit it with the same prior for all.
+
+    Args:
+        frame: Luma (H, W), image (see `sample_depth`) and focal length, px.
+        circles: (N, 3) x, y, radius, px.
+        upright: Unit vector (3,) and spread of tilts, rad.
+        settings: `Noise`; sigma of depth (2), bias (m) and edge offset (px); fewest points.
+        data: Per cap room for points, edges, rays around the circle and along the outline.
+        out: Per cap parameters, covariance, surface point with sigmas, and counts of points, edge
+            rays, outline rays, weight; and size, m. A cap without a fit keeps a count of 0.
+    """
+    gray, image, focal = frame
+    noise, sensor, least = settings
+    points, edges, around, outline = data
+    caps, covariances, _, counts = out
+    rank, work = rank_by_depth(image[0], circles, image[2]), workspace()
+    for i in range(len(circles)):
+        room = (points[i], edges[i], around[i])
+        n, m, middle = gather(image, circles[i], rank[i], focal, sensor, room)
+        if n < least or middle <= 0.0:
+            continue
+        size = circles[i, 2] * middle / focal
+        ray = ray_at(image[1], focal, circles[i, 0], circles[i, 1])
+        start(caps[i], points[i], n, upright[0], ray, middle, size)
+        known = (points[i][:, :n], edges[i][:, :m], around[i], outline[i][:, :0])
+        if not refine(caps[i], known, upright, noise, focal, size, (0, 2), work):
+            continue
+        lines = sample_outline(
+            gray, image[1], image[2], rank[i], caps[i], circles[i], focal, outline[i]
+        )
+        known = (points[i][:, :n], edges[i][:, :m], around[i], outline[i][:, :lines])
+        if not refine(caps[i], known, upright, noise, focal, size, (2, 4), work):
+            continue
+        if uncertainty(caps[i], known, upright, noise, focal, covariances[i], work) >= 0.0:
+            counts[i, 0], counts[i, 1], counts[i, 2], counts[i, 4] = n, m, lines, size
+
+
+@jit
+def second_fits(
+    frame: Any, circles: Floats, upright: tuple[Floats, float], settings: Any, data: Any, out: Any
+) -> None:
+    """Refine every fit with what the scene says of its caps' tilt; arguments as `first_fits`."""
+    _, image, focal = frame
+    noise = settings[0]
+    points, edges, around, outline = data
+    caps, covariances, surfaces, counts = out
+    squares, variances = np.full(len(caps), -1.0), np.ones(len(caps))
+    for i in range(len(caps)):
+        if counts[i, 0] > 0:
+            first, second = tilt(caps[i], upright[0])
+            squares[i] = first * first + second * second
+            variances[i] = 0.5 * (covariances[i, 3, 3] + covariances[i, 4, 4])
+    spreads, work = np.empty(len(caps)), workspace()
+    spread_of(squares, variances, upright[1], spreads)
+    for i in range(len(caps)):
+        if counts[i, 0] == 0:
+            continue
+        n, m, lines = int(counts[i, 0]), int(counts[i, 1]), int(counts[i, 2])
+        known = (points[i][:, :n], edges[i][:, :m], around[i], outline[i][:, :lines])
+        own = (upright[0], spreads[i])
+        refine(caps[i], known, own, noise, focal, counts[i, 4], (4, 5), work)
+        counts[i, 3] = uncertainty(caps[i], known, own, noise, focal, covariances[i], work)
+        ray = ray_at(image[1], focal, circles[i, 0], circles[i, 1])
+        locate(caps[i], ray, covariances[i], noise.circle_px / focal, surfaces[i])
+
+
+@jit
+def locate(cap: Floats, ray: Vector, covariance: Floats, sigma: float, out: Floats) -> None:
+    """Fill the point (3,) where a ray meets a cap, and its sigmas (3,), m.
+
+    Args:
+        cap: (15,) the cap.
+        ray: Unit vector.
+        covariance: (8, 8) of the cap.
+        sigma: Of the ray's direction, rad.
+        out: (6,) out.
+    """
+    c = frozen(cap)
+    t, k, _ = meet(c, ray, False)
+    row = np.array(slope(c, ray, t, k))
+    variance = 0.0
+    for i in range(UNKNOWNS):
+        for j in range(UNKNOWNS):
+            variance += row[3 + i] * covariance[i, j] * row[3 + j]
+    square = max(row[2], 0.1) ** 2  # of the cosine of incidence
+    far = t + row[0] / (row[1] * max(row[2], 0.3))  # a step to the surface with its bulge
+    across = (sigma * t) ** 2
+    # an error across the ray moves the point up or down the slope
+    along = (variance + across * (1.0 - square)) / square
+    for i in range(3):
+        share = ray[i] * ray[i]
+        out[i] = far * ray[i]
+        out[3 + i] = np.sqrt(along * share + across * (1.0 - share))
+
+
+def fit_caps(
+    frame: tuple[NDArray[np.float32], tuple[NDArray[np.float32], NDArray[np.float32]], float],
+    circles: Floats,
+    upright: tuple[Floats, float],
+    settings: tuple[Noise, tuple[float, float, float, float], int],
+) -> Fits:
+    """Fit a cap to the depth in each circle.
+
+    Args:
+        frame: Luma (H, W) 0..1; depth (H, W) m, 0 = missing, finite, and the rays (H, W, 2) of the
+            pixels at z = 1; focal length, px.
+        circles: (N, 3) x, y, radius, px.
+        upright: Unit vector (3,) and the spread of tilts off it per direction, rad.
+        settings: Standard deviations of the model; of the sensor: sigma of depth at the camera (m)
+            and its growth (m per m), bias (m), and how much of an edge it loses (px); the fewest
+            points that make a fit.
+    """
+    n = len(circles)
+    gray, image, focal = frame
+    out = (
+        np.full((n, SIZE), np.nan),
+        np.full((n, UNKNOWNS, UNKNOWNS), np.nan),
+        np.full((n, 6), np.nan),
+        np.zeros((n, 5)),
+    )
+    data = (
+        np.empty((n, 5, len(CELLS))),
+        np.empty((n, 3, DIRECTIONS)),
+        np.empty((n, 3, ROUND)),
+        np.empty((n, 3, DIRECTIONS)),
+    )
+    ranked = (gray, (*image, np.full(image[0].shape, n, np.int32)), focal)
+    first_fits(ranked, circles, upright, settings, data, out)
+    second_fits(ranked, circles, upright, settings, data, out)
+    return _fits(*out)
+
+
+def _fits(caps: Floats, covariances: Floats, surfaces: Floats, counts: Floats) -> Fits:
+    finite = np.isfinite(caps).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
+    valid = (counts[:, 0] > 0) & (counts[:, 3] >= 0) & finite & np.isfinite(surfaces).all(axis=1)
+    for array in (caps, covariances, surfaces):
+        array[~valid] = np.nan
+    diagonal = np.diagonal(covariances, axis1=1, axis2=2)
+    center, axis = caps[:, :3], caps[:, N : N + 3]
+    return Fits(
+        valid,
+        center,
+        axis,
+        caps[:, RADIUS],
+        caps[:, HEIGHT],
+        center + caps[:, HEIGHT, None] * axis,
+        surfaces[:, :3],
+        covariances,
+        np.sqrt(diagonal[:, 3] + diagonal[:, 4]),
+        np.sqrt(diagonal[:, 5]),
+        surfaces[:, 3:],
+        np.where(valid, np.minimum(counts[:, 3] / len(CELLS), 1.0), np.nan),
+        counts[:, 1].astype(np.int64),
+        counts[:, 2].astype(np.int64),
+    )

@@ -1,0 +1,156 @@
+"""Position, size and orientation of each cap at once, by fitting a spheroid to its depth."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from mushpipe import (
+    Camera,
+    Circles,
+    DepthSource,
+    InputError,
+    Locations,
+    Poses,
+    RgbdFrame,
+    Stage,
+    quaternion_from_axis,
+)
+from mushpipe.stages.cap_batch import Fits, fit_caps
+from mushpipe.stages.cap_solve import Noise
+from mushpipe.stages.upright import Up, pixel_rays, upright
+
+Floats = NDArray[np.float64]
+
+
+class CapFit(Stage):
+    """Fits a spheroid cap to the depth in each circle: axis, apex, diameter, with sigmas.
+
+    Seven parameters are fitted to block means of the depth, along their rays; to the depth edge and
+    the circle, which touch the cap; and to what caps are like. Nearer mushrooms' circles hide what
+    they cover. Where tilt cannot be seen the sigma says so. A mushroom with hardly any depth is
+    ``missing`` and has no pose.
+    """
+
+    up: Up = "bed"
+    tilt_deg: float = Field(
+        25, gt=0, le=90, description="spread of the tilt off the upright, degrees"
+    )
+    depth_bias_mm: float = Field(
+        0, ge=-20, le=20, description="taken off the depth; 2.85 for the SR300 of the paper"
+    )
+    depth_noise_mm: float = Field(0.3, ge=0, description="sigma of depth at the camera, mm")
+    depth_noise_per_m: float = Field(1.2, ge=0, description="its growth with depth, mm per m")
+    edge_offset_px: float = Field(
+        0.45, ge=-3, le=3, description="how much of a cap's edge the depth camera loses, px"
+    )
+    circle_sigma_px: float = Field(2, gt=0, description="sigma of the circles, px")
+    outline_sigma_px: float = Field(
+        1, gt=0, description="sigma of the outline in the colour image, alignment included, px"
+    )
+    min_points: int = Field(8, ge=6, le=97, description="fewest of 97 points a fit needs")
+
+    def open(self) -> None:
+        """Compile the kernels."""
+        camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+        circles = Circles(np.array([[32.0, 24.0]]), np.array([9.0]), np.ones(1))
+        gray = np.zeros((48, 64), np.float32)
+        depth = np.full((48, 64), 0.4, np.float32)
+        # arrays of a frame are read-only, which to the compiler is a type of its own
+        gray.flags.writeable = False
+        self.fit(gray, depth, camera, circles)
+
+    def process(self, frame: RgbdFrame, circles: Circles) -> tuple[Locations, Poses]:
+        """Return one location and one pose per circle.
+
+        Raises:
+            InputError: The frame has depth but no calibration.
+        """
+        if frame.depth is None or not len(circles):
+            return _unknown(len(circles))
+        if frame.camera is None:
+            raise InputError(
+                "depth cannot be turned into metres without the camera's calibration: record "
+                "camera_info, or set source.camera: {fx: , fy: , cx: , cy: }"
+            )
+        depth = np.fmax(frame.depth_m, np.float32(0))  # missing: 0 in place of NaN
+        fits = self.fit(frame.gray, depth, frame.camera, circles)
+        return _locations(fits, circles, depth), _poses(fits)
+
+    def fit(
+        self,
+        gray: NDArray[np.float32],
+        depth: NDArray[np.float32],
+        camera: Camera,
+        circles: Circles,
+    ) -> Fits:
+        """Return the fitted caps themselves.
+
+        Args:
+            gray: (H, W) luma, 0..1.
+            depth: (H, W) m, 0 = missing, finite.
+            camera: Intrinsics.
+            circles: Outlines, px.
+        """
+        rays = pixel_rays(camera)
+        noise = Noise(
+            shape=0.0006,
+            outline=0.03,
+            circle_px=self.circle_sigma_px,
+            edge_px=2.0,
+            color_px=self.outline_sigma_px,
+            edge_weight=0.6,
+            color_weight=0.6,
+            aspect=0.62,
+            aspect_sigma=0.2,
+            bulge=0.0,
+            bulge_sigma=0.06,
+        )
+        sensor = (
+            self.depth_noise_mm / 1000,
+            self.depth_noise_per_m / 1000,
+            self.depth_bias_mm / 1000,
+            self.edge_offset_px,
+        )
+        return fit_caps(
+            (gray, (depth, rays), (camera.fx + camera.fy) / 2),
+            np.column_stack([circles.center, circles.radius]),
+            (upright(self.up, depth, rays), float(np.radians(self.tilt_deg))),
+            (noise, sensor, self.min_points),
+        )
+
+
+def _locations(fits: Fits, circles: Circles, depth: NDArray[np.float32]) -> Locations:
+    u, v = np.rint(circles.center).astype(int).T
+    height, width = depth.shape
+    inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    measured = inside & (depth[v.clip(0, height - 1), u.clip(0, width - 1)] > 0)
+    source = np.where(measured, DepthSource.MEASURED, DepthSource.NEIGHBOURS)
+    return Locations(
+        position=fits.surface,
+        distance=np.linalg.norm(fits.surface, axis=1),
+        diameter=2 * fits.radius,
+        source=np.where(fits.valid, source, DepthSource.MISSING).astype(np.uint8),
+        sigma_position=fits.sigma_surface,
+        sigma_diameter=2 * fits.sigma_radius,
+    )
+
+
+def _poses(fits: Fits) -> Poses:
+    return Poses(
+        quaternion=quaternion_from_axis(fits.axis),
+        axis=fits.axis,
+        apex=fits.apex,
+        sigma_rad=fits.sigma_tilt,
+        fitness=fits.fitness,
+        valid=fits.valid,
+    )
+
+
+def _unknown(n: int) -> tuple[Locations, Poses]:
+    nan = np.full((n, 4), np.nan)
+    three, one = nan[:, :3], nan[:, 0]
+    missing = np.full(n, DepthSource.MISSING, np.uint8)
+    locations = Locations(three, one, one, missing, three, one)
+    return locations, Poses(nan, three, three, one, one, np.zeros(n, bool))

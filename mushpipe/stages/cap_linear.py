@@ -1,0 +1,77 @@
+"""Normal equations of a cap: built from rows, solved by Cholesky; and a robust weight."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mushpipe.core.jit import jit
+from mushpipe.stages.cap_model import UNKNOWNS, Floats
+
+
+@jit
+def add(system: Any, rows: Floats, count: int) -> None:
+    """Add `count` columns of rows (9, M), derivatives and residual, already times root weight.
+
+    The lower triangle of the normal matrix and the gradient grow by their products.
+    """
+    normal, gradient = system
+    for i in range(UNKNOWNS):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(count):
+                total += rows[i, k] * rows[j, k]
+            normal[i, j] += total
+        total = 0.0
+        for k in range(count):
+            total += rows[i, k] * rows[UNKNOWNS, k]
+        gradient[i] += total
+
+
+@jit
+def scale(rows: Floats, weights: Floats, count: int) -> None:
+    """Multiply `count` columns of rows (9, M) by the roots of their weights (M,)."""
+    for k in range(count):
+        weights[k] = np.sqrt(weights[k])
+    for i in range(UNKNOWNS + 1):
+        for k in range(count):
+            rows[i, k] *= weights[k]
+
+
+@jit
+def cholesky(matrix: Floats) -> bool:
+    """Factor the lower triangle in place; False where it is not positive definite."""
+    for j in range(UNKNOWNS):
+        pivot = matrix[j, j]
+        for k in range(j):
+            pivot -= matrix[j, k] * matrix[j, k]
+        if not 1e-12 < pivot < 1e30:
+            return False
+        matrix[j, j] = np.sqrt(pivot)
+        for i in range(j + 1, UNKNOWNS):
+            value = matrix[i, j]
+            for k in range(j):
+                value -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = value / matrix[j, j]
+    return True
+
+
+@jit
+def substitute(factor: Floats, vector: Floats) -> None:
+    """Solve factor factor^T x = vector in place."""
+    for i in range(UNKNOWNS):
+        for k in range(i):
+            vector[i] -= factor[i, k] * vector[k]
+        vector[i] /= factor[i, i]
+    for i in range(UNKNOWNS - 1, -1, -1):
+        for k in range(i + 1, UNKNOWNS):
+            vector[i] -= factor[k, i] * vector[k]
+        vector[i] /= factor[i, i]
+
+
+@jit
+def tukey(squared: float, cut: float) -> float:
+    """Return Tukey's weight of a squared, normalised residual."""
+    rest = max(1.0 - squared / cut, 0.0)
+    return rest * rest

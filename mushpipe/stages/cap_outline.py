@@ -1,0 +1,130 @@
+"""The outline of a cap in the colour image, looked for where the fit so far expects it.
+
+Depth cameras tear and lose the edge of a cap; the colour image shows it to a fraction of a pixel.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mushpipe.core.jit import jit
+from mushpipe.stages.cap_model import Cap, Floats, frozen, meet, slope
+from mushpipe.stages.cap_samples import COMPASS, DIRECTIONS, ray_at
+
+STEP = 0.5  # px between places on a line
+REACH = 12  # steps to either side that are looked at, at most
+LEAST_STEP = 0.04  # of luma, between 1 px inside and 1 px outside
+
+
+@jit
+def bright(gray: NDArray[np.float32], x: float, y: float) -> float:
+    """Return the bilinear luma at a place in the image, -1 outside."""
+    u, v = int(np.floor(x)), int(np.floor(y))
+    if u < 0 or v < 0 or u + 1 >= gray.shape[1] or v + 1 >= gray.shape[0]:
+        return -1.0
+    fx, fy = x - u, y - v
+    top = gray[v, u] * (1.0 - fx) + gray[v, u + 1] * fx
+    low = gray[v + 1, u] * (1.0 - fx) + gray[v + 1, u + 1] * fx
+    return float(top * (1.0 - fy) + low * fy)
+
+
+@jit
+def expected_reach(
+    c: Cap, rays: NDArray[np.float32], focal: float, x: float, y: float, radius: float, turn: Floats
+) -> float:
+    """Return how far from (x, y), px, the outline of a cap lies in the direction turn (2,)."""
+    reach = radius
+    for _ in range(2):
+        ray = ray_at(rays, focal, x + reach * turn[0], y + reach * turn[1])
+        t, k, _ = meet(c, ray, True)
+        change = slope(c, ray, t, k)
+        step = change[0] / change[1] * focal / c[2]
+        reach -= min(max(step, -0.3 * radius), 0.3 * radius)
+    return reach
+
+
+@jit
+def steepest(profile: Floats, count: int, sign: float) -> tuple[float, float]:
+    """Return where a profile (count,) falls (sign 1) or rises (-1) most steeply, and by how much.
+
+    The place is in steps, to a fraction of one by a parabola, and -1 where it lies at an end.
+    """
+    wide = int(1.0 / STEP)
+    best, place = 0.0, -1
+    for k in range(wide, count - wide):
+        fall = sign * (profile[k - wide] - profile[k + wide])
+        # of two equal steps the nearer one to where it is expected
+        fall *= 1.0 - 0.4 * abs(k - 0.5 * (count - 1)) / (0.5 * count)
+        if fall > best:
+            best, place = fall, k
+    if place <= wide or place >= count - wide - 1:
+        return -1.0, 0.0
+    left = sign * (profile[place - 1 - wide] - profile[place - 1 + wide])
+    right = sign * (profile[place + 1 - wide] - profile[place + 1 + wide])
+    middle = sign * (profile[place - wide] - profile[place + wide])
+    bend = left - 2.0 * middle + right
+    shift = 0.5 * (left - right) / bend if bend < -1e-9 else 0.0
+    return place + min(max(shift, -0.5), 0.5), middle
+
+
+@jit
+def sample_outline(
+    gray: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    ranks: NDArray[np.int32],
+    rank: int,
+    cap: Floats,
+    circle: Floats,
+    focal: float,
+    out: Floats,
+) -> int:
+    """Find the outline of a cap in the colour image, in 32 directions.
+
+    Args:
+        gray: (H, W) luma, 0..1.
+        rays: (H, W, 2) rays at z = 1.
+        ranks: (H, W) rank of the nearest circle per pixel.
+        rank: This circle's; a place that a nearer one covers is left out.
+        cap: (15,) the estimate.
+        circle: (3,) x, y, radius, px.
+        focal: Focal length, px.
+        out: (3, DIRECTIONS) out: unit rays along the outline.
+
+    Returns:
+        Number of rays.
+    """
+    c = frozen(cap)
+    profiles = np.empty((DIRECTIONS, 2 * REACH + 1))
+    reaches = np.zeros(DIRECTIONS)
+    half = min(REACH, max(5, int(0.2 * circle[2] / STEP)))
+    count, contrast = 2 * half + 1, 0.0
+    for j in range(DIRECTIONS):
+        turn = COMPASS[j]
+        reach = expected_reach(c, rays, focal, circle[0], circle[1], circle[2], turn)
+        if not 0.5 * circle[2] < reach < 1.6 * circle[2]:
+            continue
+        x, y = circle[0] + reach * turn[0], circle[1] + reach * turn[1]
+        u, v = int(np.floor(x + 0.5)), int(np.floor(y + 0.5))
+        if not (0 <= u < ranks.shape[1] and 0 <= v < ranks.shape[0]) or ranks[v, u] < rank:
+            continue
+        known = True
+        for k in range(count):
+            along = (k - half) * STEP
+            profiles[j, k] = bright(gray, x + along * turn[0], y + along * turn[1])
+            known = known and profiles[j, k] >= 0.0
+        if known:
+            reaches[j] = reach
+            contrast += profiles[j, 0] - profiles[j, count - 1]
+    n = 0
+    for j in range(DIRECTIONS):
+        if reaches[j] == 0.0:
+            continue
+        place, fall = steepest(profiles[j], count, 1.0 if contrast > 0 else -1.0)
+        if place < 0.0 or fall < LEAST_STEP:
+            continue
+        reach = reaches[j] + (place - half) * STEP
+        x, y = circle[0] + reach * COMPASS[j, 0], circle[1] + reach * COMPASS[j, 1]
+        out[0, n], out[1, n], out[2, n] = ray_at(rays, focal, x, y)
+        n += 1
+    return n

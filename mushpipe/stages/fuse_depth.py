@@ -1,0 +1,108 @@
+"""Depth averaged over the last frames, without mixing what lies behind with what lies before."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, PrivateAttr
+
+from mushpipe import RgbdFrame, Stage
+from mushpipe.core.jit import jit
+
+Singles = NDArray[np.float32]
+
+
+class FuseDepth(Stage):
+    """Averages depth over the last frames of a camera at rest, and fills holes from them.
+
+    A pixel whose depth leaves its mean by more than the gate starts anew: it sees another surface
+    now. A pixel without depth keeps its mean until it has been without for `frames` frames.
+    Between shots of a moving camera nothing agrees, and frames pass as they are.
+    """
+
+    frames: int = Field(5, ge=1, le=100, description="frames that are averaged")
+    gate_mm: float = Field(
+        4, gt=0, le=100, description="step of depth at which a pixel starts anew"
+    )
+    moved: float = Field(
+        0.3, gt=0, le=1, description="share of pixels starting anew at which all of them do"
+    )
+
+    _mean: Singles | None = PrivateAttr(None)
+    _count: NDArray[np.uint8] | None = PrivateAttr(None)
+    _age: NDArray[np.uint8] | None = PrivateAttr(None)
+    _scale: float = PrivateAttr(0.0)
+
+    def open(self) -> None:
+        """Compile the kernel and forget what was seen."""
+        for dtype in (np.uint16, np.float32):
+            depth = np.ones((2, 2), dtype)
+            depth.flags.writeable = False
+            state = np.zeros((2, 2), np.float32), np.zeros((2, 2), np.uint8)
+            fuse(depth, *state, np.zeros((2, 2), np.uint8), 1.0, 2)
+        self._mean = None
+
+    def process(self, frame: RgbdFrame) -> RgbdFrame:
+        """Return the frame with its mean depth, float32 in the sensor's unit, 0 = missing."""
+        if frame.depth is None:
+            return frame
+        depth = frame.depth
+        if depth.dtype == np.float32:
+            depth = np.nan_to_num(depth, posinf=0.0, neginf=0.0)
+            depth.flags.writeable = False
+        if (
+            self._mean is None
+            or self._mean.shape != depth.shape
+            or self._scale != frame.depth_scale
+        ):
+            self._forget(frame)
+        gate = self.gate_mm / 1000 / frame.depth_scale
+        fresh = fuse(depth, self._mean, self._count, self._age, gate, self.frames)
+        if fresh > self.moved * depth.size:
+            self._forget(frame)
+            fuse(depth, self._mean, self._count, self._age, gate, self.frames)
+        return replace(frame, depth=np.array(self._mean))
+
+    def _forget(self, frame: RgbdFrame) -> None:
+        shape = frame.color.shape[:2]
+        self._mean, self._scale = np.zeros(shape, np.float32), frame.depth_scale
+        self._count, self._age = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
+
+
+@jit
+def fuse(depth: NDArray[Any], mean: Any, count: Any, age: Any, gate: float, frames: int) -> int:
+    """Take one more depth image into a mean.
+
+    Args:
+        depth: (H, W) native, 0 = missing, finite.
+        mean: (H, W) float32, in and out, 0 = missing.
+        count: (H, W) uint8, in and out, how many frames each mean holds.
+        age: (H, W) uint8, in and out, for how many frames each pixel had no depth.
+        gate: Step at which a pixel starts anew, native.
+        frames: Most frames that a mean holds.
+
+    Returns:
+        How many pixels started anew.
+    """
+    fresh = 0
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            z = np.float32(depth[v, u])
+            if z <= 0:
+                if mean[v, u] > 0:
+                    age[v, u] += 1
+                    if age[v, u] >= frames:
+                        mean[v, u], count[v, u] = 0, 0
+                continue
+            age[v, u] = 0
+            step = z - mean[v, u]
+            if mean[v, u] > 0 and abs(step) <= gate:
+                count[v, u] = min(count[v, u] + 1, frames)
+                mean[v, u] += step / np.float32(count[v, u])
+            else:
+                fresh += mean[v, u] > 0
+                mean[v, u], count[v, u] = z, 1
+    return fresh

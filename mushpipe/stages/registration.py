@@ -1,0 +1,220 @@
+"""The paper's 3D pose (section VI): an upright model registered to each mushroom's points."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field, PrivateAttr
+
+from mushpipe import (
+    Circles,
+    GraphPath,
+    InputError,
+    Locations,
+    Poses,
+    RgbdFrame,
+    Stage,
+    quaternion_from_axis,
+)
+from mushpipe.core.libraries import import_open3d
+from mushpipe.stages.upright import Up, pixel_rays, upright
+from mushpipe.stages.upright_model import Model, made, read
+
+Floats = NDArray[np.float64]
+
+
+class Registration(Stage):
+    """Registers the cloud of an upright mushroom to each mushroom's depth, with Open3D.
+
+    As in the paper: voxel downsampling, normals, FPFH features, Fast Global Registration, then
+    ICP; the pose is the turn that takes the upright model to the mushroom, without its spin. The
+    tilt's sigma is unknown. `cap-fit` is better and far faster; this is for comparison.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    model: Literal["mushroom", "cap"] | GraphPath = Field(
+        "mushroom", description="the project's mushroom, its cap alone, or a mesh or cloud, z up"
+    )
+    global_: Literal["fgr", "ransac", "none"] = Field(
+        "fgr", alias="global", description="global registration; none starts upright"
+    )
+    local: Literal["point-to-point", "point-to-plane"] = Field(
+        "point-to-point", description="error that ICP makes small"
+    )
+    voxel: float = Field(0.12, gt=0.01, le=1, description="voxel, in radii of the cap")
+    up: Up = "bed"
+    steepest_deg: float = Field(
+        60, gt=0, le=180, description="a global registration that leans more has failed, degrees"
+    )
+    min_points: int = Field(30, ge=10, description="fewest points of a mushroom, after thinning")
+
+    _model: Any = PrivateAttr(None)
+
+    def open(self) -> None:
+        """Load Open3D and the model.
+
+        Raises:
+            DependencyError: open3d or a library of the system is missing.
+            InputError: The model's file has too few points.
+        """
+        import_open3d()
+        if self.model in ("mushroom", "cap"):
+            self._model = made(self.model == "mushroom", self.voxel)
+        else:
+            self._model = read(self.model, self.voxel)  # type: ignore[arg-type]
+
+    def process(
+        self, frame: RgbdFrame, circles: Circles, locations: Locations, rng: np.random.Generator
+    ) -> Poses:
+        """Return one pose per circle; not valid where too few points have depth.
+
+        Raises:
+            InputError: The frame has depth but no calibration.
+        """
+        if self._model is None:
+            self.open()
+        n = len(circles)
+        axis, apex, fitness = np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.full(n, np.nan)
+        if frame.depth is not None and n:
+            if frame.camera is None:
+                raise InputError("depth cannot be turned into metres without the calibration")
+            o3d = import_open3d()
+            # seeds RANSAC and the tuple test of FGR; ICP and FPFH draw nothing
+            o3d.utility.random.seed(int(rng.integers(2**31)))
+            depth = np.fmax(frame.depth_m, np.float32(0))
+            rays = pixel_rays(frame.camera)
+            up, focal = upright(self.up, depth, rays), (frame.camera.fx + frame.camera.fy) / 2
+            view = (depth, rays, up, focal)
+            with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+                for i in np.flatnonzero(np.isfinite(locations.distance)):
+                    found = self._pose(view, circles, locations, int(i))
+                    if found is not None:
+                        axis[i], apex[i], fitness[i] = found
+        valid = np.isfinite(axis).all(axis=1)
+        return Poses(quaternion_from_axis(axis), axis, apex, np.full(n, np.nan), fitness, valid)
+
+    def _pose(
+        self, view: Any, circles: Circles, locations: Locations, i: int
+    ) -> tuple[Floats, Floats, float] | None:
+        depth, rays, up, focal = view
+        size = circles.radius[i] * locations.position[i, 2] / focal
+        points = _inside(depth, rays, circles.center[i], circles.radius[i], size)
+        deeper = 1 + self._model.top * size / locations.distance[i]
+        return self.register(points, locations.position[i] * deeper, size, up)
+
+    def register(
+        self, points: Floats, center: Floats, size: float, up: Floats
+    ) -> tuple[Floats, Floats, float] | None:
+        """Register the model to the points of one mushroom.
+
+        Args:
+            points: (M, 3) m.
+            center: (3,) m, where the model starts: about the centre of the rim.
+            size: Radius of the cap, m.
+            up: (3,) unit, how the model stands at the start.
+
+        Returns:
+            Axis (3,), apex (3,) m and ICP's fitness 0..1; None where there are too few points.
+        """
+        o3d, model = import_open3d(), self._model
+        if not isinstance(model, Model) or len(points) < self.min_points:
+            return None
+        # In radii around the start and with the model upright there: distances need no unit, and
+        # the identity, which Open3D returns without a word where it fails, means "upright".
+        turn = upright_turn(up)
+        target = _cloud(o3d, (points - center) / size, None).voxel_down_sample(self.voxel)
+        if len(target.points) < self.min_points:
+            return None
+        self._orient(o3d, target, -center / size)
+        source = _cloud(o3d, model.points @ turn.T, model.normals @ turn.T)
+        start = self._start(o3d, source, target)
+        if up @ start[:3, :3] @ up < np.cos(np.radians(self.steepest_deg)):
+            start = np.eye(4)  # a smooth cap fits upside down as well
+        result = self._refine(o3d, source, target, start)
+        total = np.asarray(result.transformation)
+        axis = total[:3, :3] @ turn @ model.axis
+        apex = total[:3, :3] @ (turn @ (model.top * model.axis)) + total[:3, 3]
+        return axis / np.linalg.norm(axis), apex * size + center, float(min(result.fitness, 1.0))
+
+    def _orient(self, o3d: Any, cloud: Any, eye: Floats) -> None:
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(3 * self.voxel, 30))
+        cloud.orient_normals_towards_camera_location(eye)
+
+    def _start(self, o3d: Any, source: Any, target: Any) -> Floats:
+        """Return the global registration (4, 4); the identity, which is upright, where it fails."""
+        if self.global_ == "none":
+            return np.eye(4)
+        registration = o3d.pipelines.registration
+        search = o3d.geometry.KDTreeSearchParamHybrid(5 * self.voxel, 100)
+        features = [registration.compute_fpfh_feature(c, search) for c in (source, target)]
+        reach = 1.5 * self.voxel
+        if self.global_ == "fgr":
+            # distances are normalised unless absolute scale is asked for
+            option = registration.FastGlobalRegistrationOption(
+                maximum_correspondence_distance=reach, use_absolute_scale=True
+            )
+            result = registration.registration_fgr_based_on_feature_matching(
+                source, target, *features, option
+            )
+        else:
+            result = registration.registration_ransac_based_on_feature_matching(
+                source, target, *features, True, reach,
+                registration.TransformationEstimationPointToPoint(False), 3,
+                [registration.CorrespondenceCheckerBasedOnDistance(reach)],
+                registration.RANSACConvergenceCriteria(20_000, 0.999),
+            )  # fmt: skip
+        return np.asarray(result.transformation)
+
+    def _refine(self, o3d: Any, source: Any, target: Any, start: Floats) -> Any:
+        registration = o3d.pipelines.registration
+        if self.local == "point-to-plane":
+            estimation = registration.TransformationEstimationPointToPlane(
+                registration.TukeyLoss(self.voxel)
+            )
+        else:
+            estimation = registration.TransformationEstimationPointToPoint()
+        criteria = registration.ICPConvergenceCriteria(max_iteration=200)
+        return registration.registration_icp(
+            source, target, 3 * self.voxel, start, estimation, criteria
+        )
+
+
+def upright_turn(up: Floats) -> Floats:
+    """Return the shortest rotation (3, 3) that takes +z to a unit vector."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_quat(quaternion_from_axis(up[None])[0]).as_matrix())
+
+
+def _cloud(o3d: Any, points: Floats, normals: Floats | None) -> Any:
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    if normals is not None:
+        cloud.normals = o3d.utility.Vector3dVector(normals)
+    return cloud
+
+
+def _inside(
+    depth: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    center: Floats,
+    radius: float,
+    size: float,
+) -> Floats:
+    """Return the points (M, 3) m in a circle (px), within the depth a cap of that size spans."""
+    height, width = depth.shape
+    (left, top), (right, bottom) = (
+        np.clip(np.floor(center - radius), 0, (width, height)).astype(int),
+        np.clip(np.ceil(center + radius) + 1, 0, (width, height)).astype(int),
+    )
+    v, u = np.mgrid[top:bottom, left:right]
+    z = depth[top:bottom, left:right].astype(np.float64)
+    inside = (z > 0) & ((u - center[0]) ** 2 + (v - center[1]) ** 2 <= radius**2)
+    if not inside.any():
+        return np.zeros((0, 3))
+    middle = np.median(z[inside])
+    inside &= (z > middle - 0.8 * size) & (z < middle + size)
+    xy = rays[top:bottom, left:right][inside].astype(np.float64)
+    return np.column_stack([xy * z[inside, None], z[inside]])

@@ -1,0 +1,90 @@
+"""Depth of exact spheroid caps, by a ray caster that shares nothing with the product's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mushpipe import Camera, Circles, Header, RgbdFrame
+
+CAMERA = Camera(320, 240, 400.0, 400.0, 159.5, 119.5)
+LIP = 0.25
+
+
+@dataclass(frozen=True)
+class Cap:
+    center: np.ndarray
+    axis: np.ndarray
+    radius: float
+    height: float
+
+    @property
+    def apex(self) -> np.ndarray:
+        return self.center + self.height * self.axis
+
+
+def cap(tilt: float, turn: float, at: tuple[float, float, float], radius: float, aspect: float):
+    """A cap tilted by `tilt` towards `turn` (degrees) off the axis that points at the camera."""
+    t, p = np.radians([tilt, turn])
+    axis = np.array([np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), -np.cos(t)])
+    return Cap(np.array(at), axis, radius, aspect * radius)
+
+
+def frame_of(axis: np.ndarray) -> np.ndarray:
+    """A rotation (3, 3) with the axis as its last column."""
+    helper = np.eye(3)[np.argmin(np.abs(axis))]
+    x = np.cross(helper, axis)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(axis, x), axis], axis=1)
+
+
+def half_depth(rays: np.ndarray, c: Cap, half_axis: float, upper: bool) -> np.ndarray:
+    """Depth of one half, by scaling space until the spheroid is a unit sphere."""
+    shrink = (frame_of(c.axis) / [c.radius, c.radius, half_axis]).T
+    direction, origin = rays @ shrink.T, -shrink @ c.center
+    a, b = (direction**2).sum(-1), direction @ origin
+    root = b * b - a * (origin @ origin - 1)
+    with np.errstate(invalid="ignore"):
+        roots = [(-b + sign * np.sqrt(root)) / a for sign in (-1, 1)]
+        depth = np.full(rays.shape[:-1], np.inf)
+        for z in roots:
+            side = (rays * z[..., None] - c.center) @ c.axis
+            good = (root > 0) & (z > 0) & ((side >= 0) if upper else (side <= 0))
+            depth = np.where(good, np.minimum(depth, z), depth)
+    return depth
+
+
+def draw(caps: list[Cap], bed: float, camera: Camera = CAMERA) -> tuple[np.ndarray, np.ndarray]:
+    """Depth (H, W) m over a bed at z = bed, and luma: caps 0.8, bed 0.2, anti-aliased."""
+    depth, color = [], np.zeros((camera.height, camera.width))
+    for dv, du in [(0.0, 0.0), (-0.25, -0.25), (-0.25, 0.25), (0.25, -0.25), (0.25, 0.25)]:
+        v, u = np.mgrid[: camera.height, : camera.width].astype(float)
+        pixels = np.stack([u + du, v + dv], axis=-1)
+        rays = camera.deproject(pixels, np.ones(u.shape))
+        z = np.full(u.shape, bed)
+        for c in caps:
+            z = np.minimum(z, half_depth(rays, c, c.height, True))
+            z = np.minimum(z, half_depth(rays, c, LIP * c.radius, False))
+        depth.append(z)
+        if du:
+            color += np.where(z < bed, 0.8, 0.2) / 4
+    return depth[0], color
+
+
+def frame_from(depth: np.ndarray, gray: np.ndarray, camera: Camera | None = CAMERA) -> RgbdFrame:
+    color = np.repeat(np.rint(gray * 255).astype(np.uint8)[..., None], 3, axis=2)
+    native = np.nan_to_num(depth).astype(np.float32)
+    return RgbdFrame(Header(1, 0, "optical"), color, native, 1.0, camera)
+
+
+def circle_of(c: Cap, camera: Camera = CAMERA) -> tuple[float, float, float]:
+    """Centroid and equal-area radius of the outline of a cap that nothing hides."""
+    depth, _ = draw([c], 10.0, camera)
+    v, u = np.nonzero(depth < 10.0)
+    return float(u.mean()), float(v.mean()), float(np.sqrt(len(u) / np.pi))
+
+
+def circles_of(caps: list[Cap], camera: Camera = CAMERA) -> Circles:
+    table = np.array([circle_of(c, camera) for c in caps]).reshape(-1, 3)
+    return Circles(table[:, :2], table[:, 2], np.ones(len(caps)))

@@ -1,0 +1,70 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mushpipe import Header, RgbdFrame
+from mushpipe.stages.depth_correct import DepthCorrect
+from mushpipe.stages.fuse_depth import FuseDepth
+
+SHAPE = (40, 50)
+
+
+def frame(depth: np.ndarray | None, scale: float = 0.001) -> RgbdFrame:
+    return RgbdFrame(Header(1, 0, "optical"), np.zeros((*SHAPE, 3), np.uint8), depth, scale)
+
+
+def test_noise_falls_by_the_root_of_the_number_of_frames() -> None:
+    rng, stage = np.random.default_rng(0), FuseDepth(frames=5)
+    stage.open()
+    for _ in range(5):
+        native = np.rint(4000 + rng.normal(0, 8, SHAPE)).astype(np.uint16)
+        out = stage.process(frame(native, 0.000125))
+    assert out.depth_scale == 0.000125
+    assert out.depth is not None
+    assert out.depth.std() == pytest.approx(8 / np.sqrt(5), rel=0.06)
+    assert out.depth.mean() == pytest.approx(4000, abs=0.5)
+
+
+def test_two_surfaces_are_never_mixed_and_edges_stay() -> None:
+    stage = FuseDepth(frames=5)
+    left, right = np.full(SHAPE, 500, np.uint16), np.full(SHAPE, 500, np.uint16)
+    left[:, 20:], right[:, 22:] = 530, 530
+    for k in range(6):
+        out = stage.process(frame(left if k % 2 else right))
+        assert set(np.unique(out.depth)) == {500, 530}
+    assert (out.depth == left).all()
+
+
+def test_holes_are_filled_for_a_while() -> None:
+    stage = FuseDepth(frames=3)
+    whole, hole = np.full(SHAPE, 500, np.uint16), np.full(SHAPE, 500, np.uint16)
+    hole[3, 4] = 0
+    stage.process(frame(whole))
+    assert [stage.process(frame(hole)).depth[3, 4] for _ in range(3)] == [500, 500, 0]
+
+
+def test_a_scene_that_moved_starts_anew() -> None:
+    stage = FuseDepth()
+    ramp = np.linspace(400, 600, 50).astype(np.float32) * np.ones(SHAPE, np.float32)
+    stage.process(frame(ramp))
+    out = stage.process(frame(ramp[:, ::-1].copy()))
+    assert (out.depth == ramp[:, ::-1]).all()
+
+
+def test_nan_is_missing_and_no_depth_passes() -> None:
+    stage = FuseDepth()
+    depth = np.full(SHAPE, np.nan, np.float32)
+    assert (stage.process(frame(depth)).depth == 0).all()
+    assert stage.process(frame(None)).depth is None
+    assert DepthCorrect(offset_mm=3).process(frame(None)).depth is None
+
+
+def test_correction_takes_the_polynomial_off_and_keeps_the_unit() -> None:
+    depth = np.full(SHAPE, 4000, np.uint16)
+    depth[0, 0] = 0
+    stage = DepthCorrect(offset_mm=2.0, slope_mm_per_m=4.0, curve_mm_per_m2=8.0)
+    out = stage.process(frame(depth, 0.000125))
+    assert out.depth_m[1, 1] == pytest.approx(0.5 - 0.002 - 0.002 - 0.002, abs=1e-6)
+    assert np.isnan(out.depth_m[0, 0])
+    assert out.depth_scale == 0.000125

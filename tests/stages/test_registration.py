@@ -1,0 +1,162 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mushpipe import Circles, DepthSource, InputError, Locations
+from mushpipe.core.errors import DependencyError
+from mushpipe.stages.nearest_depth import NearestDepth
+from mushpipe.stages.registration import Registration
+from mushpipe.stages.upright_model import made, read
+from tests.stages.caps import cap, circles_of, draw, frame_from
+
+try:
+    from mushpipe.core.libraries import import_open3d
+
+    o3d = import_open3d()
+except DependencyError as error:
+    pytest.skip(str(error), allow_module_level=True)
+
+UP = np.array([0.0, 0.0, -1.0])
+
+
+def stage(**settings: object) -> Registration:
+    made = Registration.model_validate(settings)
+    made.open()
+    return made
+
+
+def seen(tilt: float, turn: float, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Points (M, 3) of the model, 20 mm in radius, as a camera above sees them; its axis."""
+    model = made(full=False, spacing=0.05)
+    lean = Rotation.from_euler("zyx", [turn, tilt, 0], degrees=True)
+    flip = Rotation.from_euler("x", 180, degrees=True)  # z up to z towards the camera
+    points = (flip * lean).apply(model.points) * 0.02
+    normals = (flip * lean).apply(model.normals)
+    points = points[normals[:, 2] < -0.2] + [0.03, -0.02, 0.4]
+    points = points + np.random.default_rng(0).normal(0, noise, points.shape)
+    return points, (flip * lean).apply([0, 0, 1])
+
+
+def angle(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))
+
+
+@pytest.mark.parametrize("local", ["point-to-point", "point-to-plane"])
+@pytest.mark.parametrize("start", ["none", "fgr"])
+def test_a_clean_cloud_of_the_model_itself_is_found(local: str, start: str) -> None:
+    found = stage(model="cap", local=local, **{"global": start})
+    for tilt, turn in [(0, 0), (12, 40), (20, 200)]:
+        points, axis = seen(tilt, turn)
+        result = found.register(points, np.array([0.03, -0.02, 0.4]), 0.02, UP)
+        assert result is not None
+        # what the camera does not see of the model pulls it back to where it stood
+        assert angle(result[0], axis) < 9
+        assert np.linalg.norm(result[1] - ([0.03, -0.02, 0.4] + 0.62 * 0.02 * axis)) < 4.5e-3
+        assert 0.8 < result[2] <= 1
+
+
+def test_the_pieces_are_those_of_open3d_called_by_hand() -> None:
+    points, _ = seen(18, 70, 0.0005)
+    center = np.array([0.03, -0.02, 0.4])
+    ours = stage(model="cap", **{"global": "fgr"})
+    o3d.utility.random.seed(5)
+    axis, apex, _ = ours.register(points, center, 0.02, UP) or pytest.fail("no pose")
+
+    model, flip = made(False, 0.12), np.diag([1.0, -1.0, -1.0])
+    source = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(model.points @ flip))
+    source.normals = o3d.utility.Vector3dVector(model.normals @ flip)
+    target = o3d.geometry.PointCloud(o3d.utility.Vector3dVector((points - center) / 0.02))
+    target = target.voxel_down_sample(0.12)
+    target.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(0.36, 30))
+    target.orient_normals_towards_camera_location(-center / 0.02)
+    r = o3d.pipelines.registration
+    search = o3d.geometry.KDTreeSearchParamHybrid(0.6, 100)
+    features = [r.compute_fpfh_feature(c, search) for c in (source, target)]
+    o3d.utility.random.seed(5)
+    option = r.FastGlobalRegistrationOption(
+        maximum_correspondence_distance=0.18, use_absolute_scale=True
+    )
+    coarse = r.registration_fgr_based_on_feature_matching(source, target, *features, option)
+    start = coarse.transformation
+    if start[2, 2] < 0.5:
+        start = np.eye(4)
+    fine = r.registration_icp(
+        source,
+        target,
+        0.36,
+        start,
+        r.TransformationEstimationPointToPoint(),
+        r.ICPConvergenceCriteria(max_iteration=200),
+    ).transformation
+    assert axis == pytest.approx(fine[:3, :3] @ [0, 0, -1], abs=1e-4)
+    assert apex == pytest.approx((fine @ [0, 0, -0.62, 1])[:3] * 0.02 + center, abs=1e-5)
+
+
+def scene() -> tuple[np.ndarray, np.ndarray, Circles]:
+    caps = [cap(15, 30, (-0.03, 0, 0.3), 0.02, 0.6), cap(10, 200, (0.04, 0.01, 0.3), 0.022, 0.6)]
+    return *draw(caps, 0.34), circles_of(caps)
+
+
+def test_the_stage_gives_the_same_twice_and_marks_what_it_cannot_know() -> None:
+    depth, gray, circles = scene()
+    circles = Circles(
+        np.vstack([circles.center, [[20, 20]]]), [*circles.radius, 12], [1.0, 1.0, 1.0]
+    )
+    depth[5:36, 5:36] = np.nan
+    frame = frame_from(depth, gray)
+    locations = NearestDepth().process(frame, circles)
+    assert locations.source[2] == DepthSource.MISSING
+    poses = [
+        stage(up="camera").process(frame, circles, locations, np.random.default_rng(1))
+        for _ in range(2)
+    ]
+    assert poses[0].valid.tolist() == [True, True, False]
+    assert (poses[0].axis[:2] == poses[1].axis[:2]).all()
+    assert np.isnan(poses[0].sigma_rad).all()
+    turned = Rotation.from_quat(poses[0].quaternion[:2]).apply([0, 0, 1])
+    assert turned == pytest.approx(poses[0].axis[:2])
+    assert (poses[0].quaternion[:2, 2] == 0).all()  # no spin
+
+
+def test_no_depth_gives_no_pose_and_no_calibration_an_error() -> None:
+    depth, gray, circles = scene()
+    frame = frame_from(depth, gray)
+    locations = NearestDepth().process(frame, circles)
+    nothing = frame_from(np.full(depth.shape, np.nan), gray)
+    poses = stage().process(nothing, circles, locations, np.random.default_rng(0))
+    assert not poses.valid.any()
+    with pytest.raises(InputError, match="calibration"):
+        stage().process(frame_from(depth, gray, None), circles, locations, np.random.default_rng(0))
+
+
+def test_a_model_of_the_users_own_is_read_in_any_unit(tmp_path) -> None:
+    own = made(full=True, spacing=0.05)
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(own.points * 40 + [7, -3, 90]))
+    o3d.io.write_point_cloud(str(tmp_path / "m.ply"), cloud)
+    model = read(tmp_path / "m.ply", 0.1)
+    assert np.hypot(*model.points[:, :2].T).max() == pytest.approx(1, abs=0.05)
+    assert model.top == pytest.approx(0.62, abs=0.08)
+    assert angle(model.axis, np.array([0, 0, 1])) < 3
+    upper = model.points[:, 2] > 0.2
+    assert (model.normals[upper] * model.points[upper]).sum(axis=1).min() > 0
+
+
+def test_a_file_without_points_is_an_input_error(tmp_path) -> None:
+    (tmp_path / "empty.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nend_header\n")
+    with pytest.raises(InputError, match="0 points"):
+        read(tmp_path / "empty.ply", 0.1)
+
+
+def test_locations_may_come_from_any_stage() -> None:
+    depth, gray, circles = scene()
+    position = np.array([[-0.03, 0, 0.289], [0.04, 0.01, 0.287]])
+    nan = np.full(2, np.nan)
+    locations = Locations(
+        position, np.linalg.norm(position, axis=1), nan, [1, 1], np.full((2, 3), np.nan), nan
+    )
+    poses = stage(up="camera").process(
+        frame_from(depth, gray), circles, locations, np.random.default_rng(0)
+    )
+    assert poses.valid.all()
