@@ -120,7 +120,7 @@ def serve(arguments: argparse.Namespace, folder: str) -> dict[str, Any]:
     handed: dict[int, float] = {}
     consumed: list[float] = []
     sink.open(RunInfo("benchmark", {}, live=True, frames_read=lambda: len(handed)))
-    assert sink._server is not None  # noqa: S101
+    assert sink._server is not None
     port = sink._server.ports[0]
     command = [sys.executable, __file__, "--listen", str(port), str(arguments.clients - 1)]
     stuck = Stuck(port)
