@@ -1,0 +1,244 @@
+"""Thin sub-pixel edges: gradients of a Gaussian, an adaptive threshold, maxima along the gradient."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mushpipe.core.jit import jit
+
+Plane = NDArray[np.float32]
+Singles = NDArray[np.float32]
+Rows = NDArray[np.int32]
+SIGMA = 1.1
+_OFFSETS = np.arange(-3, 4)
+SMOOTH = np.exp(-(_OFFSETS**2) / (2 * SIGMA**2)).astype(np.float32)
+SMOOTH /= SMOOTH.sum()
+# Weights of the differences at a distance of 1, 2, 3 px; a ramp of 1 per px has the gradient 1.
+SLOPE = (_OFFSETS * SMOOTH / (_OFFSETS**2 * SMOOTH).sum()).astype(np.float32)[4:]
+
+
+class Gradient(NamedTuple):
+    """Derivatives of a smoothed image.
+
+    Attributes:
+        x: (H, W) per px.
+        y: (H, W) per px.
+        size: (H, W) magnitude.
+    """
+
+    x: Plane
+    y: Plane
+    size: Plane
+
+
+class Edges(NamedTuple):
+    """Edge points with their normals.
+
+    Attributes:
+        x: (M,) px, sub-pixel.
+        y: (M,) px.
+        nx: (M,) unit normal, towards the brighter or higher side.
+        ny: (M,)
+        strength: (M,) gradient over the threshold, at least 1.
+        weight: (M,) how far its place can be trusted, 0..1; depth edges less than gray ones.
+        index: (H, W) row of the edge point at a pixel, -1 for none.
+    """
+
+    x: Singles
+    y: Singles
+    nx: Singles
+    ny: Singles
+    strength: Singles
+    weight: Singles
+    index: Rows
+
+
+@jit
+def gradient(image: Plane, smooth: Singles, slope: Singles) -> tuple[Plane, Plane, Plane]:
+    """Return the derivatives by x and y and the magnitude, by 7 taps each way; borders repeat."""
+    height, width = image.shape
+    gx, gy, size = np.empty_like(image), np.empty_like(image), np.empty_like(image)
+    level, change = np.empty(width + 6, np.float32), np.empty(width + 6, np.float32)
+    s0, s1, s2, s3 = smooth[3], smooth[2], smooth[1], smooth[0]
+    d1, d2, d3 = slope[0], slope[1], slope[2]
+    for y in range(height):
+        a, b, c = max(y - 3, 0), max(y - 2, 0), max(y - 1, 0)
+        d, e, f = min(y + 1, height - 1), min(y + 2, height - 1), min(y + 3, height - 1)
+        for x in range(width):
+            p1, m1, p2, m2 = image[d, x], image[c, x], image[e, x], image[b, x]
+            p3, m3 = image[f, x], image[a, x]
+            level[x + 3] = s0 * image[y, x] + s1 * (p1 + m1) + s2 * (p2 + m2) + s3 * (p3 + m3)
+            change[x + 3] = d1 * (p1 - m1) + d2 * (p2 - m2) + d3 * (p3 - m3)
+        for k in range(3):
+            level[k], change[k] = level[3], change[3]
+            level[width + 3 + k], change[width + 3 + k] = level[width + 2], change[width + 2]
+        for x in range(width):
+            u = (
+                d1 * (level[x + 4] - level[x + 2])
+                + d2 * (level[x + 5] - level[x + 1])
+                + d3 * (level[x + 6] - level[x])
+            )
+            v = (
+                s0 * change[x + 3]
+                + s1 * (change[x + 4] + change[x + 2])
+                + s2 * (change[x + 5] + change[x + 1])
+                + s3 * (change[x + 6] + change[x])
+            )
+            gx[y, x], gy[y, x] = u, v
+            size[y, x] = np.sqrt(u * u + v * v)
+    return gx, gy, size
+
+
+def gradient_of(image: Plane) -> Gradient:
+    """Return the gradient of an (H, W) float32 image."""
+    return Gradient(*gradient(image, SMOOTH, SLOPE))
+
+
+@jit
+def otsu_of(size: Plane, top: float) -> float:
+    """Return Otsu's threshold (1979) of the values at every second pixel, in 256 bins to `top`."""
+    bins = np.zeros(256, np.int64)
+    scale = np.float32(256 / top)
+    for y in range(0, size.shape[0], 2):
+        for x in range(0, size.shape[1], 2):
+            bins[min(255, int(size[y, x] * scale))] += 1
+    total, mean = 0.0, 0.0
+    for k in range(256):
+        total += bins[k]
+        mean += k * bins[k]
+    best, threshold, weight, first = -1.0, 0, 0.0, 0.0
+    for k in range(255):
+        weight += bins[k]
+        first += k * bins[k]
+        if weight == 0 or weight == total:
+            continue
+        between = (mean * weight / total - first) ** 2 / (weight * (total - weight))
+        if between > best:
+            best, threshold = between, k
+    return (threshold + 1) / scale
+
+
+@jit
+def _at(plane: Plane, x: float, y: float) -> float:
+    """Bilinear value; the point lies within the image."""
+    u, v = int(x), int(y)
+    fx, fy = x - u, y - v
+    top = plane[v, u] * (1 - fx) + plane[v, u + 1] * fx
+    bottom = plane[v + 1, u] * (1 - fx) + plane[v + 1, u + 1] * fx
+    return float(top * (1 - fy) + bottom * fy)
+
+
+@jit
+def thin(
+    gx: Plane,
+    gy: Plane,
+    size: Plane,
+    region: NDArray[np.uint8],
+    threshold: float,
+    points: Plane,
+    index: Rows,
+) -> int:
+    """Write the maxima of the gradient along its direction, within a region, into `points`.
+
+    The offset along the normal is the vertex of the parabola through the magnitudes one pixel
+    before, at, and behind the pixel. `index` receives the row at each pixel.
+
+    Args:
+        gx: (H, W) gradient.
+        gy: (H, W)
+        size: (H, W) its magnitude.
+        region: (H, W) where to look.
+        threshold: Least magnitude.
+        points: (capacity, 5) receives x, y, nx, ny, magnitude over threshold.
+        index: (H, W)
+
+    Returns:
+        The number of points; looking ends where `points` is full.
+    """
+    height, width = size.shape
+    count = 0
+    for y in range(2, height - 2):
+        for x in range(2, width - 2):
+            m = size[y, x]
+            if m <= threshold or region[y, x] == 0:
+                continue
+            nx, ny = gx[y, x] / m, gy[y, x] / m
+            ahead = _at(size, x + nx, y + ny)
+            behind = _at(size, x - nx, y - ny)
+            if ahead > m or behind >= m:
+                continue
+            bend = ahead - 2 * m + behind
+            t = 0.5 * (behind - ahead) / bend if bend < -1e-6 else 0.0
+            if count == len(points):
+                return count
+            points[count, 0], points[count, 1] = x + t * nx, y + t * ny
+            points[count, 2], points[count, 3] = nx, ny
+            points[count, 4] = m / threshold
+            index[y, x] = count
+            count += 1
+    return count
+
+
+def edges_of(grad: Gradient, region: NDArray[np.uint8], threshold: float) -> Edges:
+    """Return the thin edges above a threshold within a region (H, W)."""
+    index = np.full(grad.size.shape, -1, np.int32)
+    points = np.empty((grad.size.size // 3 + 1, 5), np.float32)
+    count = thin(*grad, region, threshold, points, index)
+    x, y, nx, ny, strength = np.ascontiguousarray(points[:count].T)
+    return Edges(x, y, nx, ny, strength, np.ones(count, np.float32), index)
+
+
+@jit
+def _free_of_edges(index: Rows, x: int, y: int) -> bool:
+    for v in range(max(y - 1, 0), min(y + 2, index.shape[0])):
+        for u in range(max(x - 1, 0), min(x + 2, index.shape[1])):
+            if index[v, u] >= 0:
+                return False
+    return True
+
+
+@jit
+def unexplained(index: Rows, x: Singles, y: Singles, first: int) -> NDArray[np.bool_]:
+    """Enter further edge points into `index` where it is empty around them; return which were.
+
+    Rows are numbered from `first`, among the kept ones only.
+    """
+    kept = np.zeros(len(x), np.bool_)
+    row = first
+    for k in range(len(x)):
+        u, v = int(x[k] + 0.5), int(y[k] + 0.5)
+        inside = 0 <= u < index.shape[1] and 0 <= v < index.shape[0]
+        if inside and _free_of_edges(index, u, v):
+            kept[k] = True
+    for k in range(len(x)):
+        if kept[k]:
+            index[int(y[k] + 0.5), int(x[k] + 0.5)] = row
+            row += 1
+    return kept
+
+
+def joined(gray: Edges, depth: Edges, scale: float, trust: float) -> Edges:
+    """Return gray edges and those depth edges that lie where there is no gray one.
+
+    Args:
+        gray: Edges of the image.
+        depth: Edges of a height map with pixels `scale` times as large.
+        scale: Size of a pixel of the height map in image pixels.
+        trust: Weight of a depth edge.
+    """
+    x = (depth.x + np.float32(0.5)) * np.float32(scale) - np.float32(0.5)
+    y = (depth.y + np.float32(0.5)) * np.float32(scale) - np.float32(0.5)
+    kept = unexplained(gray.index, x, y, len(gray.x))
+    weight = np.full(int(kept.sum()), trust, np.float32)
+    return Edges(
+        np.concatenate([gray.x, x[kept]]),
+        np.concatenate([gray.y, y[kept]]),
+        np.concatenate([gray.nx, depth.nx[kept]]),
+        np.concatenate([gray.ny, depth.ny[kept]]),
+        np.concatenate([gray.strength, depth.strength[kept]]),
+        np.concatenate([gray.weight, weight]),
+        gray.index,
+    )

@@ -1,0 +1,206 @@
+"""Refit of a candidate to the edge points of its outline, to a fraction of a pixel.
+
+The outline is r(t) = r + p cos 2t + q sin 2t around the centre: a circle, and to first order the
+ellipse of a tilted cap. Its five parameters minimise the distances of the edge points along the
+radius by Gauss-Newton with the weights of Geman & McClure (1987), on fewer and fewer far points. The
+circle of the same area has the radius sqrt(r^2 + (p^2 + q^2) / 2).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mushpipe.core.jit import jit
+from mushpipe.stages.phase_edges import Edges, Plane, Rows, Singles
+
+DIRECTIONS = 96
+ROUNDS = 4
+REACH = 0.28  # of the radius: how far from the candidate edge points are looked for
+OVAL = 0.07  # of the radius: expected size of p and q
+TURNED = 0.7  # cosine between an edge's normal and the radius
+ALIGNED = 0.8
+PER_DIRECTION = 3
+
+
+@jit
+def directions_of(radius: float) -> int:
+    """Return how many directions an outline is looked at in: one every 2 px."""
+    return min(DIRECTIONS, max(24, int(math.pi * radius)))
+
+
+@jit
+def tolerance(radius: float) -> float:
+    """Return how far (px) from the outline an edge point still supports it."""
+    return max(1.5, 0.07 * radius)
+
+
+@jit
+def gather(edges: Edges, x: float, y: float, radius: float, rows: Rows) -> int:
+    """Write the rows of edge points around an outline that face its centre; return their number.
+
+    Along each direction the pixels within `REACH` of the outline are looked at, and up to
+    `PER_DIRECTION` edge points taken.
+    """
+    height, width = edges.index.shape
+    count, n = 0, directions_of(radius)
+    reach = max(3.0, REACH * radius)
+    for k in range(n):
+        c, s = math.cos(2 * math.pi * k / n), math.sin(2 * math.pi * k / n)
+        taken, last = 0, -1
+        for step in range(int(2 * reach) + 1):
+            t = radius - reach + step
+            u, v = int(x + t * c + 0.5), int(y + t * s + 0.5)
+            if t < 1 or u < 0 or v < 0 or u >= width or v >= height:
+                continue
+            row = edges.index[v, u]
+            if row < 0 or row == last or -(c * edges.nx[row] + s * edges.ny[row]) < TURNED:
+                continue
+            last = row
+            rows[count] = row
+            count += 1
+            taken += 1
+            if taken == PER_DIRECTION or count == len(rows):
+                break
+        if count == len(rows):
+            break
+    return count
+
+
+@jit
+def _solve5(a: NDArray[np.float64], b: NDArray[np.float64]) -> None:
+    """Solve a x = b in place for a positive definite (5, 5) matrix; x replaces b."""
+    for i in range(5):
+        for j in range(i + 1, 5):
+            factor = a[j, i] / a[i, i]
+            for k in range(i, 5):
+                a[j, k] -= factor * a[i, k]
+            b[j] -= factor * b[i]
+    for i in range(4, -1, -1):
+        for k in range(i + 1, 5):
+            b[i] -= a[i, k] * b[k]
+        b[i] /= a[i, i]
+
+
+@jit
+def _accumulate(
+    edges: Edges, rows: Rows, count: int, shape: NDArray[np.float64], scale: float,
+    a: NDArray[np.float64], b: NDArray[np.float64],
+) -> float:  # fmt: skip
+    """Add the normal equations of the edge points to a (5, 5), b (5,); return the sum of weights.
+
+    `shape` is x, y, r, p, q; `scale` the residual (px) at which a weight has fallen to a quarter.
+    """
+    total = 0.0
+    j = np.empty(5)
+    for k in range(count):
+        row = rows[k]
+        dx, dy = edges.x[row] - shape[0], edges.y[row] - shape[1]
+        d = math.sqrt(dx * dx + dy * dy)
+        if d < 1:
+            continue
+        c, s = dx / d, dy / d
+        c2, s2 = c * c - s * s, 2 * s * c
+        e = d - (shape[2] + shape[3] * c2 + shape[4] * s2)
+        facing = -(c * edges.nx[row] + s * edges.ny[row])
+        if facing < TURNED:
+            continue
+        w = edges.weight[row] * facing / (1 + (e / scale) ** 2) ** 2
+        j[0], j[1], j[2], j[3], j[4] = c, s, 1.0, c2, s2
+        for m in range(5):
+            b[m] += w * j[m] * e
+            for n in range(m, 5):
+                a[m, n] += w * j[m] * j[n]
+        total += w
+    return total
+
+
+@jit
+def fit_outline(edges: Edges, rows: Rows, count: int, shape: NDArray[np.float64]) -> bool:
+    """Improve x, y, r, p, q (5,) in place; False where the points do not hold it in place."""
+    start_x, start_y, start_r = shape[0], shape[1], shape[2]
+    a, b = np.empty((5, 5)), np.empty(5)
+    for turn in range(ROUNDS):
+        scale = max(1.0, (0.16, 0.11, 0.08, 0.06)[turn] * shape[2])
+        a[:] = 0
+        b[:] = 0
+        if _accumulate(edges, rows, count, shape, scale, a, b) < 4:
+            return False
+        prior = 4 / max(1.0, (OVAL * shape[2]) ** 2)
+        for m in range(5):
+            for n in range(m):
+                a[m, n] = a[n, m]
+            a[m, m] += 0.3
+        for m in (3, 4):
+            a[m, m] += prior
+            b[m] -= prior * shape[m]
+        _solve5(a, b)
+        for m in range(5):
+            shape[m] += b[m]
+        moved = math.hypot(shape[0] - start_x, shape[1] - start_y)
+        if moved > max(3.0, 0.4 * start_r) or not 0.6 * start_r < shape[2] < 1.6 * start_r:
+            return False
+    return True
+
+
+@jit
+def outline_hits(edges: Edges, shape: NDArray[np.float64], hits: Rows) -> tuple[int, float]:
+    """Write per direction the row of the nearest edge point that supports the outline, else -1.
+
+    Returns:
+        The number of directions, and the root mean square distance of the hits (px).
+    """
+    height, width = edges.index.shape
+    x, y, r = shape[0], shape[1], shape[2]
+    n, near = directions_of(r), tolerance(r)
+    found, squares = 0, 0.0
+    for k in range(n):
+        c, s = math.cos(2 * math.pi * k / n), math.sin(2 * math.pi * k / n)
+        radius = r + shape[3] * (c * c - s * s) + shape[4] * 2 * s * c
+        best, hits[k] = near, -1
+        for step in range(int(2 * near) + 3):
+            t = radius - near - 1 + step
+            u, v = int(x + t * c + 0.5), int(y + t * s + 0.5)
+            if u < 0 or v < 0 or u >= width or v >= height:
+                continue
+            row = edges.index[v, u]
+            if row < 0 or -(c * edges.nx[row] + s * edges.ny[row]) < ALIGNED:
+                continue
+            away = abs((edges.x[row] - x) * c + (edges.y[row] - y) * s - radius)
+            if away < best:
+                best, hits[k] = away, row
+        if hits[k] >= 0:
+            found += 1
+            squares += best * best
+    return n, math.sqrt(squares / max(found, 1))
+
+
+@jit
+def refit(
+    edges: Edges, candidates: Plane, smallest: float, largest: float
+) -> tuple[NDArray[np.float64], Rows, Singles]:
+    """Refit candidates (N, 4) to the edges; those that nothing holds in place are dropped.
+
+    Returns:
+        Outlines (M, 5), the hits of their directions (M, `DIRECTIONS`), -2 beyond the last
+        direction, and the distances of the hits (M,), px.
+    """
+    n = len(candidates)
+    shapes, residual = np.empty((n, 5)), np.empty(n, np.float32)
+    hits = np.full((n, DIRECTIONS), -2, np.int32)
+    rows = np.empty(PER_DIRECTION * DIRECTIONS, np.int32)
+    kept = 0
+    for k in range(n):
+        shape = shapes[kept]
+        shape[0], shape[1], shape[2] = candidates[k, 0], candidates[k, 1], candidates[k, 2]
+        shape[3] = shape[4] = 0
+        count = gather(edges, shape[0], shape[1], shape[2], rows)
+        if count < 6 or not fit_outline(edges, rows, count, shape):
+            continue
+        if not smallest * 0.9 <= shape[2] <= largest * 1.1:
+            continue
+        residual[kept] = outline_hits(edges, shape, hits[kept])[1]
+        kept += 1
+    return shapes[:kept], hits[:kept], residual[:kept]
