@@ -13,6 +13,8 @@ Plane = NDArray[np.float32]
 Singles = NDArray[np.float32]
 Rows = NDArray[np.int32]
 SIGMA = 1.1
+UNCONFIRMED = 0.4  # weight of a gray edge without, and of a depth edge without the other
+DEPTH_ALONE = 0.6
 _OFFSETS = np.arange(-3, 4)
 SMOOTH = np.exp(-(_OFFSETS**2) / (2 * SIGMA**2)).astype(np.float32)
 SMOOTH /= SMOOTH.sum()
@@ -182,63 +184,75 @@ def thin(
     return count
 
 
-def edges_of(grad: Gradient, region: NDArray[np.uint8], threshold: float) -> Edges:
-    """Return the thin edges above a threshold within a region (H, W)."""
+def edges_of(
+    grad: Gradient, region: NDArray[np.uint8], threshold: float, full: float = 0.0
+) -> Edges:
+    """Return the thin edges above a threshold within a region (H, W).
+
+    The weight of an edge grows with its gradient and is 1 from `full` on.
+    """
     index = np.full(grad.size.shape, -1, np.int32)
     points = np.empty((grad.size.size // 3 + 1, 5), np.float32)
     count = thin(*grad, region, threshold, points, index)
     x, y, nx, ny, strength = np.ascontiguousarray(points[:count].T)
-    return Edges(x, y, nx, ny, strength, np.ones(count, np.float32), index)
+    weight = np.minimum(1, strength * np.float32(threshold / full)) if full else strength / strength
+    return Edges(x, y, nx, ny, strength, weight, index)
 
 
 @jit
-def _free_of_edges(index: Rows, x: int, y: int) -> bool:
-    for v in range(max(y - 1, 0), min(y + 2, index.shape[0])):
-        for u in range(max(x - 1, 0), min(x + 2, index.shape[1])):
-            if index[v, u] >= 0:
-                return False
-    return True
+def confirm(
+    x: Singles, y: Singles, nx: Singles, ny: Singles, gray: Edges, reach: int
+) -> NDArray[np.bool_]:
+    """Give the gray edges that a depth edge runs along full weight; return the edges without one.
 
+    Args:
+        x: (M,) px, depth edges in the pixels of the image.
+        y: (M,) px.
+        nx: (M,) unit normals.
+        ny: (M,)
+        gray: Edges whose weight is raised.
+        reach: How far (px) a gray edge may lie from its depth edge.
 
-@jit
-def unexplained(index: Rows, x: Singles, y: Singles, first: int) -> NDArray[np.bool_]:
-    """Enter further edge points into `index` where it is empty around them; return which were.
-
-    Rows are numbered from `first`, among the kept ones only.
+    Returns:
+        (M,) True where there is no gray edge of about the same direction.
     """
-    kept = np.zeros(len(x), np.bool_)
-    row = first
+    height, width = gray.index.shape
+    alone = np.ones(len(x), np.bool_)
     for k in range(len(x)):
         u, v = int(x[k] + 0.5), int(y[k] + 0.5)
-        inside = 0 <= u < index.shape[1] and 0 <= v < index.shape[0]
-        if inside and _free_of_edges(index, u, v):
-            kept[k] = True
-    for k in range(len(x)):
-        if kept[k]:
-            index[int(y[k] + 0.5), int(x[k] + 0.5)] = row
-            row += 1
-    return kept
+        for row in range(max(v - reach, 0), min(v + reach + 1, height)):
+            for column in range(max(u - reach, 0), min(u + reach + 1, width)):
+                j = gray.index[row, column]
+                if j >= 0 and nx[k] * gray.nx[j] + ny[k] * gray.ny[j] > 0.8:
+                    gray.weight[j] = 1
+                    alone[k] = False
+    return alone
 
 
-def joined(gray: Edges, depth: Edges, scale: float, trust: float) -> Edges:
-    """Return gray edges and those depth edges that lie where there is no gray one.
+def fused(gray: Edges, depth: Edges, scale: float) -> Edges:
+    """Return gray edges, and the depth edges that lie where there is no gray one.
+
+    A gray edge without a depth edge beside it may be a shadow, dirt or shading: it weighs less.
 
     Args:
         gray: Edges of the image.
-        depth: Edges of a height map with pixels `scale` times as large.
+        depth: Edges of a height map.
         scale: Size of a pixel of the height map in image pixels.
-        trust: Weight of a depth edge.
     """
-    x = (depth.x + np.float32(0.5)) * np.float32(scale) - np.float32(0.5)
-    y = (depth.y + np.float32(0.5)) * np.float32(scale) - np.float32(0.5)
-    kept = unexplained(gray.index, x, y, len(gray.x))
-    weight = np.full(int(kept.sum()), trust, np.float32)
+    half = np.float32(0.5)
+    x, y = ((p + half) * np.float32(scale) - half for p in (depth.x, depth.y))
+    weight = gray.weight * np.float32(UNCONFIRMED)
+    alone = confirm(x, y, depth.nx, depth.ny, gray._replace(weight=weight), 2)
+    height, width = gray.index.shape
+    alone &= (x > 0) & (y > 0) & (x < width - 1) & (y < height - 1)
+    rows = np.arange(len(gray.x), len(gray.x) + int(alone.sum()), dtype=np.int32)
+    gray.index[np.rint(y[alone]).astype(int), np.rint(x[alone]).astype(int)] = rows
     return Edges(
-        np.concatenate([gray.x, x[kept]]),
-        np.concatenate([gray.y, y[kept]]),
-        np.concatenate([gray.nx, depth.nx[kept]]),
-        np.concatenate([gray.ny, depth.ny[kept]]),
-        np.concatenate([gray.strength, depth.strength[kept]]),
-        np.concatenate([gray.weight, weight]),
+        np.concatenate([gray.x, x[alone]]),
+        np.concatenate([gray.y, y[alone]]),
+        np.concatenate([gray.nx, depth.nx[alone]]),
+        np.concatenate([gray.ny, depth.ny[alone]]),
+        np.concatenate([gray.strength, depth.strength[alone]]),
+        np.concatenate([weight, np.full(len(rows), DEPTH_ALONE, np.float32)]),
         gray.index,
     )

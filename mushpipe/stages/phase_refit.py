@@ -23,6 +23,7 @@ OVAL = 0.07  # of the radius: expected size of p and q
 TURNED = 0.7  # cosine between an edge's normal and the radius
 ALIGNED = 0.8
 PER_DIRECTION = 3
+STEP_UP = 0.004  # m
 
 
 @jit
@@ -38,22 +39,56 @@ def tolerance(radius: float) -> float:
 
 
 @jit
-def gather(edges: Edges, x: float, y: float, radius: float, rows: Rows) -> int:
+def height_at(height: Plane, x: float, y: float) -> float:
+    """Return the height (m) at an image point; -1 where it is unknown."""
+    u, v = int((x + 0.5) * 0.5), int((y + 0.5) * 0.5)
+    if x < 0 or y < 0 or u >= height.shape[1] or v >= height.shape[0]:
+        return -1.0
+    return float(height[v, u])
+
+
+@jit
+def rise(height: Plane, x: float, y: float, c: float, s: float, radius: float) -> float:
+    """Return by how much (m) the highest point just outside an outline lies over its inside.
+
+    Negative where everything outside is lower; 0 where nothing is known.
+    """
+    inside = max(
+        height_at(height, x + 0.75 * radius * c, y + 0.75 * radius * s),
+        height_at(height, x + 0.85 * radius * c, y + 0.85 * radius * s),
+    )
+    outside = -1.0
+    for k in range(3):
+        t = radius * (1.12 + 0.08 * k) + 1.5
+        outside = max(outside, height_at(height, x + t * c, y + t * s))
+    if inside == -1 or outside == -1:
+        return 0.0
+    return outside - inside
+
+
+@jit
+def gather(
+    edges: Edges, height: Plane, step_up: float, shape: NDArray[np.float64], rows: Rows
+) -> int:
     """Write the rows of edge points around an outline that face its centre; return their number.
 
     Along each direction the pixels within `REACH` of the outline are looked at, and up to
-    `PER_DIRECTION` edge points taken.
+    `PER_DIRECTION` edge points taken; none where it is higher outside by `step_up` (m), for there
+    something nearer hides the outline.
     """
-    height, width = edges.index.shape
+    x, y, radius = shape[0], shape[1], shape[2]
+    lines, width = edges.index.shape
     count, n = 0, directions_of(radius)
     reach = max(3.0, REACH * radius)
     for k in range(n):
         c, s = math.cos(2 * math.pi * k / n), math.sin(2 * math.pi * k / n)
+        if len(height) and rise(height, x, y, c, s, radius) > step_up:
+            continue
         taken, last = 0, -1
         for step in range(int(2 * reach) + 1):
             t = radius - reach + step
             u, v = int(x + t * c + 0.5), int(y + t * s + 0.5)
-            if t < 1 or u < 0 or v < 0 or u >= width or v >= height:
+            if t < 1 or u < 0 or v < 0 or u >= width or v >= lines:
                 continue
             row = edges.index[v, u]
             if row < 0 or row == last or -(c * edges.nx[row] + s * edges.ny[row]) < TURNED:
@@ -179,9 +214,17 @@ def outline_hits(edges: Edges, shape: NDArray[np.float64], hits: Rows) -> tuple[
 
 @jit
 def refit(
-    edges: Edges, candidates: Plane, smallest: float, largest: float
+    edges: Edges, height: Plane, pixel: float, candidates: Plane, smallest: float, largest: float
 ) -> tuple[NDArray[np.float64], Rows, Singles]:
     """Refit candidates (N, 4) to the edges; those that nothing holds in place are dropped.
+
+    Args:
+        edges: Edge points.
+        height: (h, w) m at half resolution, -1 where unknown; empty without depth.
+        pixel: Size of a pixel at the bed, m.
+        candidates: x, y, radius (px) and magnitude.
+        smallest: Radius, px.
+        largest: Radius, px.
 
     Returns:
         Outlines (M, 5), the hits of their directions (M, `DIRECTIONS`), -2 beyond the last
@@ -196,7 +239,7 @@ def refit(
         shape = shapes[kept]
         shape[0], shape[1], shape[2] = candidates[k, 0], candidates[k, 1], candidates[k, 2]
         shape[3] = shape[4] = 0
-        count = gather(edges, shape[0], shape[1], shape[2], rows)
+        count = gather(edges, height, max(STEP_UP, 0.15 * shape[2] * pixel), shape, rows)
         if count < 6 or not fit_outline(edges, rows, count, shape):
             continue
         if not smallest * 0.9 <= shape[2] <= largest * 1.1:
