@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from mushpipe import RgbdFrame
 from mushpipe.core.jit import jit
-from mushpipe.stages.phase_edges import Edges, Plane, edges_of, gradient_of
+from mushpipe.stages.phase_edges import Edges, Plane, depth_edges
 
 CELL = 2  # px of the image per px of the height map
 GRID = 12  # px of the height map per cell of the bed's fit
 FILL = 8  # px of the height map: widest gap that is closed for edges
-STEEP = 1.3  # slope of an edge, height over length
+STEEP = 1.0  # slope of an edge, height over length
 ROUGH = 0.003  # m; roughness of the bed that still counts as bed
 
 
@@ -153,9 +153,7 @@ class Relief:
 
     def edges(self) -> Edges:
         """Return the depth discontinuities, in pixels of the height map."""
-        smooth = gradient_of(closed(self.height))
-        region = np.ones(self.height.shape, np.uint8)
-        return edges_of(smooth, region, STEEP * CELL * self.pixel)
+        return depth_edges(closed(self.height), STEEP * CELL * self.pixel)
 
 
 def relief_of(frame: RgbdFrame) -> Relief | None:

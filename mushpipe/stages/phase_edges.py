@@ -15,6 +15,11 @@ Rows = NDArray[np.int32]
 SIGMA = 1.1
 UNCONFIRMED = 0.4  # weight of a gray edge without, and of a depth edge without the other
 DEPTH_ALONE = 0.6
+DEPTH_OUTWARD = 0.6  # px; a depth camera loses that much of a surface at its edge
+# Between two caps the steepest step lies within the shaded rim, not on the outline. How far within
+# depends on how bright it is outside, over inside: fitted to the simulator's outlines.
+DIM, BRIGHT, SHIFT = 0.25, 0.8, 2.3
+BRIGHT_TRUST = 0.4
 _OFFSETS = np.arange(-3, 4)
 SMOOTH = np.exp(-(_OFFSETS**2) / (2 * SIGMA**2)).astype(np.float32)
 SMOOTH /= SMOOTH.sum()
@@ -134,7 +139,14 @@ def _at(plane: Plane, x: float, y: float) -> float:
 
 
 @jit
+def _within(plane: Plane, x: float, y: float) -> tuple[float, float]:
+    right, bottom = plane.shape[1] - 1.001, plane.shape[0] - 1.001
+    return min(max(x, 0.0), right), min(max(y, 0.0), bottom)
+
+
+@jit
 def thin(
+    image: Plane,
     gx: Plane,
     gy: Plane,
     size: Plane,
@@ -149,12 +161,14 @@ def thin(
     before, at, and behind the pixel. `index` receives the row at each pixel.
 
     Args:
-        gx: (H, W) gradient.
+        image: (H, W)
+        gx: (H, W) its gradient.
         gy: (H, W)
-        size: (H, W) its magnitude.
+        size: (H, W) magnitude of the gradient.
         region: (H, W) where to look.
         threshold: Least magnitude.
-        points: (capacity, 5) receives x, y, nx, ny, magnitude over threshold.
+        points: (capacity, 6) receives x, y, nx, ny, magnitude over threshold, and how bright it is
+            beyond the edge, over before it.
         index: (H, W)
 
     Returns:
@@ -179,31 +193,61 @@ def thin(
             points[count, 0], points[count, 1] = x + t * nx, y + t * ny
             points[count, 2], points[count, 3] = nx, ny
             points[count, 4] = m / threshold
+            inside = _at(image, *_within(image, x + 3 * nx, y + 3 * ny))
+            outside = min(
+                _at(image, *_within(image, x - 2.5 * nx, y - 2.5 * ny)),
+                _at(image, *_within(image, x - 3.5 * nx, y - 3.5 * ny)),
+            )
+            points[count, 5] = max(outside, 0.0) / max(inside, 1e-3)
             index[y, x] = count
             count += 1
     return count
 
 
 def edges_of(
-    grad: Gradient, region: NDArray[np.uint8], threshold: float, full: float = 0.0
+    image: Plane, grad: Gradient, region: NDArray[np.uint8], threshold: float, full: float
 ) -> Edges:
-    """Return the thin edges above a threshold within a region (H, W).
+    """Return the thin edges of an image in the place of the outlines they stand for.
 
-    The weight of an edge grows with its gradient and is 1 from `full` on.
+    Args:
+        image: (H, W) gray levels.
+        grad: Its gradient.
+        region: (H, W) where to look.
+        threshold: Least gradient.
+        full: Gradient from which on an edge has its full weight.
     """
-    index = np.full(grad.size.shape, -1, np.int32)
-    points = np.empty((grad.size.size // 3 + 1, 5), np.float32)
-    count = thin(*grad, region, threshold, points, index)
-    x, y, nx, ny, strength = np.ascontiguousarray(points[:count].T)
-    weight = np.minimum(1, strength * np.float32(threshold / full)) if full else strength / strength
-    return Edges(x, y, nx, ny, strength, weight, index)
+    x, y, nx, ny, strength, bright, index = _thin_edges(image, grad, region, threshold)
+    share = np.clip((bright - DIM) / (BRIGHT - DIM), 0, 1).astype(np.float32)
+    weight = np.minimum(1, strength * np.float32(threshold / full))
+    weight *= 1 - (1 - np.float32(BRIGHT_TRUST)) * share
+    outward = np.float32(SHIFT) * share
+    return Edges(x - outward * nx, y - outward * ny, nx, ny, strength, weight, index)
+
+
+def depth_edges(height: Plane, threshold: float) -> Edges:
+    """Return the thin edges of a height map (H, W), all of the same weight."""
+    region = np.ones(height.shape, np.uint8)
+    x, y, nx, ny, strength, _, index = _thin_edges(
+        height, gradient_of(height), region, threshold
+    )
+    return Edges(x, y, nx, ny, strength, np.full(len(x), DEPTH_ALONE, np.float32), index)
+
+
+def _thin_edges(
+    image: Plane, grad: Gradient, region: NDArray[np.uint8], threshold: float
+) -> tuple[Singles, Singles, Singles, Singles, Singles, Singles, Rows]:
+    index = np.full(image.shape, -1, np.int32)
+    points = np.empty((image.size // 3 + 1, 6), np.float32)
+    count = thin(image, *grad, region, threshold, points, index)
+    x, y, nx, ny, strength, bright = np.ascontiguousarray(points[:count].T)
+    return x, y, nx, ny, strength, bright, index
 
 
 @jit
 def confirm(
-    x: Singles, y: Singles, nx: Singles, ny: Singles, gray: Edges, reach: int
+    x: Singles, y: Singles, nx: Singles, ny: Singles, gray: Edges, trust: Singles, reach: int
 ) -> NDArray[np.bool_]:
-    """Give the gray edges that a depth edge runs along full weight; return the edges without one.
+    """Give the gray edges that a depth edge runs along their trust; return the edges without one.
 
     Args:
         x: (M,) px, depth edges in the pixels of the image.
@@ -211,10 +255,11 @@ def confirm(
         nx: (M,) unit normals.
         ny: (M,)
         gray: Edges whose weight is raised.
+        trust: (N,) to what it is raised.
         reach: How far (px) a gray edge may lie from its depth edge.
 
     Returns:
-        (M,) True where there is no gray edge of about the same direction.
+        (M,) True where there is no better gray edge of about the same direction.
     """
     height, width = gray.index.shape
     alone = np.ones(len(x), np.bool_)
@@ -223,9 +268,11 @@ def confirm(
         for row in range(max(v - reach, 0), min(v + reach + 1, height)):
             for column in range(max(u - reach, 0), min(u + reach + 1, width)):
                 j = gray.index[row, column]
-                if j >= 0 and nx[k] * gray.nx[j] + ny[k] * gray.ny[j] > 0.8:
-                    gray.weight[j] = 1
+                if j < 0 or nx[k] * gray.nx[j] + ny[k] * gray.ny[j] < 0.8:
+                    continue
+                if trust[j] > DEPTH_ALONE:
                     alone[k] = False
+                gray.weight[j] = trust[j]
     return alone
 
 
@@ -240,9 +287,11 @@ def fused(gray: Edges, depth: Edges, scale: float) -> Edges:
         scale: Size of a pixel of the height map in image pixels.
     """
     half = np.float32(0.5)
-    x, y = ((p + half) * np.float32(scale) - half for p in (depth.x, depth.y))
+    x = (depth.x + half) * np.float32(scale) - half - np.float32(DEPTH_OUTWARD) * depth.nx
+    y = (depth.y + half) * np.float32(scale) - half - np.float32(DEPTH_OUTWARD) * depth.ny
     weight = gray.weight * np.float32(UNCONFIRMED)
-    alone = confirm(x, y, depth.nx, depth.ny, gray._replace(weight=weight), 2)
+    raised = gray._replace(weight=weight)
+    alone = confirm(x, y, depth.nx, depth.ny, raised, gray.weight, 3)
     height, width = gray.index.shape
     alone &= (x > 0) & (y > 0) & (x < width - 1) & (y < height - 1)
     rows = np.arange(len(gray.x), len(gray.x) + int(alone.sum()), dtype=np.int32)
@@ -253,6 +302,6 @@ def fused(gray: Edges, depth: Edges, scale: float) -> Edges:
         np.concatenate([gray.nx, depth.nx[alone]]),
         np.concatenate([gray.ny, depth.ny[alone]]),
         np.concatenate([gray.strength, depth.strength[alone]]),
-        np.concatenate([weight, np.full(len(rows), DEPTH_ALONE, np.float32)]),
+        np.concatenate([weight, depth.weight[alone]]),
         gray.index,
     )

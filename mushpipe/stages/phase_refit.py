@@ -195,8 +195,8 @@ def outline_hits(edges: Edges, shape: NDArray[np.float64], hits: Rows) -> tuple[
         c, s = math.cos(2 * math.pi * k / n), math.sin(2 * math.pi * k / n)
         radius = r + shape[3] * (c * c - s * s) + shape[4] * 2 * s * c
         best, hits[k] = near, -1
-        for step in range(int(2 * near) + 3):
-            t = radius - near - 1 + step
+        for step in range(int(2 * near) + 5):  # an edge may be entered up to 3 px within its place
+            t = radius - near - 3 + step
             u, v = int(x + t * c + 0.5), int(y + t * s + 0.5)
             if u < 0 or v < 0 or u >= width or v >= height:
                 continue
