@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from mushpipe.core.jit import jit
 from mushpipe.stages.phase_edges import Edges, Plane, Rows, Singles
 
+Shape = NDArray[np.float64]
+Table = NDArray[np.float64]
 DIRECTIONS = 96
 ROUNDS = 4
 REACH = 0.28  # of the radius: how far from the candidate edge points are looked for
@@ -24,6 +26,7 @@ TURNED = 0.7  # cosine between an edge's normal and the radius
 ALIGNED = 0.8
 PER_DIRECTION = 3
 STEP_UP = 0.004  # m
+HIDDEN = -3  # in a table of hits: something nearer hides the outline there
 
 
 @jit
@@ -36,6 +39,12 @@ def directions_of(radius: float) -> int:
 def tolerance(radius: float) -> float:
     """Return how far (px) from the outline an edge point still supports it."""
     return max(1.5, 0.07 * radius)
+
+
+@jit
+def step_up(radius: float) -> float:
+    """Return the difference of heights (m) that counts as a step at a cap of a radius (m)."""
+    return max(STEP_UP, 0.15 * radius)
 
 
 @jit
@@ -68,12 +77,12 @@ def rise(height: Plane, x: float, y: float, c: float, s: float, radius: float) -
 
 @jit
 def gather(
-    edges: Edges, height: Plane, step_up: float, shape: NDArray[np.float64], rows: Rows
+    edges: Edges, height: Plane, step: float, shape: Shape, rows: Rows
 ) -> int:
     """Write the rows of edge points around an outline that face its centre; return their number.
 
     Along each direction the pixels within `REACH` of the outline are looked at, and up to
-    `PER_DIRECTION` edge points taken; none where it is higher outside by `step_up` (m), for there
+    `PER_DIRECTION` edge points taken; none where it is higher outside by `step` (m), for there
     something nearer hides the outline.
     """
     x, y, radius = shape[0], shape[1], shape[2]
@@ -82,11 +91,11 @@ def gather(
     reach = max(3.0, REACH * radius)
     for k in range(n):
         c, s = math.cos(2 * math.pi * k / n), math.sin(2 * math.pi * k / n)
-        if len(height) and rise(height, x, y, c, s, radius) > step_up:
+        if len(height) and rise(height, x, y, c, s, radius) > step:
             continue
         taken, last = 0, -1
-        for step in range(int(2 * reach) + 1):
-            t = radius - reach + step
+        for k_t in range(int(2 * reach) + 1):
+            t = radius - reach + k_t
             u, v = int(x + t * c + 0.5), int(y + t * s + 0.5)
             if t < 1 or u < 0 or v < 0 or u >= width or v >= lines:
                 continue
@@ -105,7 +114,7 @@ def gather(
 
 
 @jit
-def _solve5(a: NDArray[np.float64], b: NDArray[np.float64]) -> None:
+def _solve5(a: Table, b: Table) -> None:
     """Solve a x = b in place for a positive definite (5, 5) matrix; x replaces b."""
     for i in range(5):
         for j in range(i + 1, 5):
@@ -121,8 +130,8 @@ def _solve5(a: NDArray[np.float64], b: NDArray[np.float64]) -> None:
 
 @jit
 def _accumulate(
-    edges: Edges, rows: Rows, count: int, shape: NDArray[np.float64], scale: float,
-    a: NDArray[np.float64], b: NDArray[np.float64],
+    edges: Edges, rows: Rows, count: int, shape: Shape, scale: float,
+    a: Table, b: Table,
 ) -> float:  # fmt: skip
     """Add the normal equations of the edge points to a (5, 5), b (5,); return the sum of weights.
 
@@ -153,7 +162,7 @@ def _accumulate(
 
 
 @jit
-def fit_outline(edges: Edges, rows: Rows, count: int, shape: NDArray[np.float64]) -> bool:
+def fit_outline(edges: Edges, rows: Rows, count: int, shape: Shape) -> bool:
     """Improve x, y, r, p, q (5,) in place; False where the points do not hold it in place."""
     start_x, start_y, start_r = shape[0], shape[1], shape[2]
     a, b = np.empty((5, 5)), np.empty(5)
@@ -181,7 +190,7 @@ def fit_outline(edges: Edges, rows: Rows, count: int, shape: NDArray[np.float64]
 
 
 @jit
-def outline_hits(edges: Edges, shape: NDArray[np.float64], hits: Rows) -> tuple[int, float]:
+def outline_hits(edges: Edges, shape: Shape, hits: Rows) -> tuple[int, float]:
     """Write per direction the row of the nearest edge point that supports the outline, else -1.
 
     Returns:
@@ -215,7 +224,7 @@ def outline_hits(edges: Edges, shape: NDArray[np.float64], hits: Rows) -> tuple[
 @jit
 def refit(
     edges: Edges, height: Plane, pixel: float, candidates: Plane, smallest: float, largest: float
-) -> tuple[NDArray[np.float64], Rows, Singles]:
+) -> tuple[Table, Rows, Singles]:
     """Refit candidates (N, 4) to the edges; those that nothing holds in place are dropped.
 
     Args:
@@ -239,7 +248,7 @@ def refit(
         shape = shapes[kept]
         shape[0], shape[1], shape[2] = candidates[k, 0], candidates[k, 1], candidates[k, 2]
         shape[3] = shape[4] = 0
-        count = gather(edges, height, max(STEP_UP, 0.15 * shape[2] * pixel), shape, rows)
+        count = gather(edges, height, step_up(shape[2] * pixel), shape, rows)
         if count < 6 or not fit_outline(edges, rows, count, shape):
             continue
         if not smallest * 0.9 <= shape[2] <= largest * 1.1:

@@ -1,0 +1,193 @@
+"""Accepting candidates one by one: each explains its edges away for those that come after it.
+
+The candidate with the largest probability is looked at again in the light of what has been
+accepted; where its probability fell below that of another it waits, else it is accepted, and its
+edges are used up. This is the non-maximum suppression of the detector.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mushpipe.core.jit import jit
+from mushpipe.stages.phase_edges import Edges, Rows
+from mushpipe.stages.phase_refit import HIDDEN, Shape, Table, gather, tolerance
+
+MARGIN = 1.0  # px; so far within an accepted circle an outline counts as hidden by it
+TAKEN = 2.5  # px; edges so near an accepted outline are its own
+
+
+@jit
+def lens(distance: float, first: float, second: float) -> float:
+    """Return the area that two circles share."""
+    if distance >= first + second:
+        return 0.0
+    small = min(first, second)
+    if distance <= abs(first - second):
+        return math.pi * small * small
+    a = (distance**2 + first**2 - second**2) / (2 * distance * first)
+    b = (distance**2 + second**2 - first**2) / (2 * distance * second)
+    k = (first + second - distance) * (distance + first - second)
+    k *= (distance - first + second) * (distance + first + second)
+    triangle = 0.5 * math.sqrt(max(k, 0.0))
+    sectors = first**2 * math.acos(min(1, max(-1, a))) + second**2 * math.acos(min(1, max(-1, b)))
+    return sectors - triangle
+
+
+@jit
+def overlap_features(shape: Shape, accepted: Table, row: Table) -> None:
+    """Write overlap, spans and doubled into row[4], row[5], row[6]."""
+    row[4] = row[5] = row[6] = 0
+    own = math.pi * shape[2] ** 2
+    for other in accepted:
+        d = math.hypot(other[0] - shape[0], other[1] - shape[1])
+        if d >= other[2] + shape[2]:
+            continue
+        shared, area = lens(d, shape[2], other[2]), math.pi * other[2] ** 2
+        row[4] = max(row[4], shared / own)
+        row[5] = max(row[5], shared / area)
+        row[6] = max(row[6], shared / (own + area - shared))
+
+
+@jit
+def _covered(x: float, y: float, accepted: Table) -> bool:
+    for other in accepted:
+        if (x - other[0]) ** 2 + (y - other[1]) ** 2 < max(0.0, other[2] - MARGIN) ** 2:
+            return True
+    return False
+
+
+@jit
+def outline_features(
+    edges: Edges, shape: Shape, hits: Rows, used: NDArray[np.bool_], accepted: Table, row: Table
+) -> None:
+    """Write free, support, trust and hits into row[0..3].
+
+    A direction is hidden where depth says so (`HIDDEN`), or where it lies within an accepted circle
+    and has no edge of its own left.
+    """
+    height, width = edges.index.shape
+    n, inside, free, found, weight = 0, 0, 0, 0, 0.0
+    while n < len(hits) and hits[n] != -2:
+        n += 1
+    for k in range(n):
+        t = 2 * math.pi * k / n
+        x, y = shape[0] + shape[2] * math.cos(t), shape[1] + shape[2] * math.sin(t)
+        if x < 0 or y < 0 or x > width - 1 or y > height - 1:
+            continue
+        inside += 1
+        if hits[k] == HIDDEN:
+            continue
+        if hits[k] >= 0 and not used[hits[k]]:
+            free += 1
+            found += 1
+            weight += edges.weight[hits[k]]
+        elif not _covered(x, y, accepted):
+            free += 1
+    row[0] = free / max(inside, 1)
+    row[1] = found / max(free, 1)
+    row[2] = weight / max(free, 1)
+    row[3] = math.log(1 + found)
+
+
+@jit
+def probability(row: Table, weights: Table) -> float:
+    """Return the logistic probability of a row of features.
+
+    Args:
+        row: (F,) features.
+        weights: (F + 1, 4): mean, scale, weight, weight of the square; the last row's weight is
+            the intercept.
+    """
+    logit = weights[-1, 2]
+    for k in range(len(row)):
+        z = (row[k] - weights[k, 0]) / weights[k, 1]
+        z = min(4.0, max(-4.0, z))
+        logit += weights[k, 2] * z + weights[k, 3] * z * z
+    return 1 / (1 + math.exp(-logit))
+
+
+@jit
+def _use_up(edges: Edges, shape: Shape, used: NDArray[np.bool_], rows: Rows) -> None:
+    nothing = np.zeros((0, 0), np.float32)
+    count = gather(edges, nothing, 0.0, shape, rows)
+    near = max(TAKEN, 1.3 * tolerance(shape[2]))
+    for k in range(count):
+        dx, dy = edges.x[rows[k]] - shape[0], edges.y[rows[k]] - shape[1]
+        d = max(1e-6, math.hypot(dx, dy))
+        c, s = dx / d, dy / d
+        e = d - (shape[2] + shape[3] * (c * c - s * s) + shape[4] * 2 * s * c)
+        if abs(e) < near:
+            used[rows[k]] = True
+
+
+@jit
+def decide(
+    edges: Edges, shapes: Table, hits: Rows, table: Table, depth: NDArray[np.bool_],
+    image_weights: Table, depth_weights: Table, least: float,
+) -> tuple[Rows, NDArray[np.float64]]:  # fmt: skip
+    """Accept candidates in the order of their probability.
+
+    Args:
+        edges: Edge points.
+        shapes: (N, 5) outlines.
+        hits: (N, D) rows of the edges that support them.
+        table: (N, F) features; those that depend on others are written, as they stood when the
+            candidate was accepted, or at the end.
+        depth: (N,) whether a candidate's features of depth are known.
+        image_weights: (F + 1, 4) weights where they are not.
+        depth_weights: (F + 1, 4) weights where they are.
+        least: Smallest probability that is accepted.
+
+    Returns:
+        Rows of the accepted in their order, and the probability of every candidate.
+    """
+    n = len(shapes)
+    used = np.zeros(len(edges.x), np.bool_)
+    chance, seen = np.full(n, 2.0), np.full(n, -1)
+    accepted, order = np.empty((n, 5)), np.empty(n, np.int32)
+    rows = np.empty(4096, np.int32)
+    count = 0
+    waiting = np.ones(n, np.bool_)
+    while True:
+        best, top = -1, least
+        for k in range(n):
+            if waiting[k] and chance[k] >= top:
+                best, top = k, chance[k]
+        if best < 0:
+            break
+        if seen[best] == count:
+            waiting[best] = False
+            accepted[count], order[count] = shapes[best], best
+            count += 1
+            _use_up(edges, shapes[best], used, rows)
+            continue
+        seen[best] = count
+        near = _neighbours(shapes[best], accepted[:count])
+        row = table[best]
+        outline_features(edges, shapes[best], hits[best], used, near, row)
+        overlap_features(shapes[best], near, row)
+        chance[best] = probability(row, depth_weights if depth[best] else image_weights)
+    for k in range(n):
+        if waiting[k] and seen[k] < count:
+            near = _neighbours(shapes[k], accepted[:count])
+            outline_features(edges, shapes[k], hits[k], used, near, table[k])
+            overlap_features(shapes[k], near, table[k])
+            chance[k] = probability(table[k], depth_weights if depth[k] else image_weights)
+    return order[:count], chance
+
+
+@jit
+def _neighbours(shape: Shape, accepted: Table) -> Table:
+    """Return the accepted outlines whose circle meets the circle of a shape."""
+    found = np.empty_like(accepted)
+    count = 0
+    for other in accepted:
+        reach = other[2] + shape[2]
+        if (other[0] - shape[0]) ** 2 + (other[1] - shape[1]) ** 2 < reach * reach:
+            found[count] = other
+            count += 1
+    return found[:count]
