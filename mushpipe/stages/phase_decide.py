@@ -1,8 +1,8 @@
 """Accepting candidates one by one: each explains its edges away for those that come after it.
 
-The candidate with the largest probability is looked at again in the light of what has been
-accepted; where its probability fell below that of another it waits, else it is accepted, and its
-edges are used up. This is the non-maximum suppression of the detector.
+The candidate with the largest probability is accepted, and its edges are used up. Its neighbours
+are then looked at again: another circle on the same cap has lost its support, while one below it
+need no longer show the outline that it hides. This is the non-maximum suppression of the detector.
 """
 
 from __future__ import annotations
@@ -147,37 +147,35 @@ def decide(
     """
     n = len(shapes)
     used = np.zeros(len(edges.x), np.bool_)
-    chance, seen = np.full(n, 2.0), np.full(n, -1)
+    chance, waiting = np.full(n, -1.0), np.ones(n, np.bool_)
     accepted, order = np.empty((n, 5)), np.empty(n, np.int32)
     rows = np.empty(4096, np.int32)
     count = 0
-    waiting = np.ones(n, np.bool_)
     while True:
         best, top = -1, least
         for k in range(n):
+            # Not only what it used up: what it hides, too, changes the odds of its neighbours.
+            if waiting[k] and (count == 0 or _meet(shapes[k], accepted[count - 1])):
+                near = _neighbours(shapes[k], accepted[:count])
+                outline_features(edges, shapes[k], hits[k], used, near, table[k])
+                overlap_features(shapes[k], near, table[k])
+                chance[k] = probability(table[k], depth_weights if depth[k] else image_weights)
             if waiting[k] and chance[k] >= top:
                 best, top = k, chance[k]
         if best < 0:
             break
-        if seen[best] == count:
-            waiting[best] = False
-            accepted[count], order[count] = shapes[best], best
-            count += 1
-            _use_up(edges, shapes[best], used, rows)
-            continue
-        seen[best] = count
-        near = _neighbours(shapes[best], accepted[:count])
-        row = table[best]
-        outline_features(edges, shapes[best], hits[best], used, near, row)
-        overlap_features(shapes[best], near, row)
-        chance[best] = probability(row, depth_weights if depth[best] else image_weights)
-    for k in range(n):
-        if waiting[k] and seen[k] < count:
-            near = _neighbours(shapes[k], accepted[:count])
-            outline_features(edges, shapes[k], hits[k], used, near, table[k])
-            overlap_features(shapes[k], near, table[k])
-            chance[k] = probability(table[k], depth_weights if depth[k] else image_weights)
+        waiting[best] = False
+        accepted[count], order[count] = shapes[best], best
+        count += 1
+        _use_up(edges, shapes[best], used, rows)
     return order[:count], chance
+
+
+@jit
+def _meet(one: Shape, other: Shape) -> bool:
+    """Whether two outlines are so near that accepting one may change what is known of the other."""
+    reach = one[2] + other[2] + 4
+    return bool((one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2 < reach * reach)
 
 
 @jit
