@@ -276,6 +276,22 @@ def confirm(
     return alone
 
 
+@jit
+def enter(index: Rows, x: Singles, y: Singles, rows: Rows) -> None:
+    """Enter edge points into the index: over what is there, and where it is empty next to them.
+
+    Points of a coarser grid leave gaps, through which a ray across the outline would slip.
+    """
+    for k in range(len(x)):
+        index[int(y[k] + 0.5), int(x[k] + 0.5)] = rows[k]
+    for k in range(len(x)):
+        u, v = int(x[k] + 0.5), int(y[k] + 0.5)
+        for row in range(max(v - 1, 0), min(v + 2, index.shape[0])):
+            for column in range(max(u - 1, 0), min(u + 2, index.shape[1])):
+                if index[row, column] < 0:
+                    index[row, column] = rows[k]
+
+
 def fused(gray: Edges, depth: Edges, scale: float) -> Edges:
     """Return gray edges, and the depth edges that lie where there is no gray one.
 
@@ -293,9 +309,9 @@ def fused(gray: Edges, depth: Edges, scale: float) -> Edges:
     raised = gray._replace(weight=weight)
     alone = confirm(x, y, depth.nx, depth.ny, raised, gray.weight, 3)
     height, width = gray.index.shape
-    alone &= (x > 0) & (y > 0) & (x < width - 1) & (y < height - 1)
+    alone &= (x >= 0) & (y >= 0) & (x < width - 1) & (y < height - 1)
     rows = np.arange(len(gray.x), len(gray.x) + int(alone.sum()), dtype=np.int32)
-    gray.index[np.rint(y[alone]).astype(int), np.rint(x[alone]).astype(int)] = rows
+    enter(gray.index, x[alone], y[alone], rows)
     return Edges(
         np.concatenate([gray.x, x[alone]]),
         np.concatenate([gray.y, y[alone]]),

@@ -80,7 +80,7 @@ class PhaseHough(Stage):
     )
     min_score: float = Field(0.5, ge=0, le=1, description="smallest score that is kept")
     edge: float = Field(
-        0.4, gt=0, le=2, description="least gradient, in units of Otsu's threshold of gradients"
+        0.2, gt=0, le=2, description="least gradient, in units of Otsu's threshold of gradients"
     )
     evidence: float = Field(
         0.08, ge=0.01, le=1, description="least share of an outline that votes, for a candidate"
