@@ -36,7 +36,7 @@ Bytes = NDArray[np.uint8]
 _FLOOR = 4.0  # gray levels per px; Otsu's threshold of an image without edges is noise
 _TOP = 64.0  # gray levels per px; larger gradients count as this in Otsu's threshold
 _STANDING = 0.004  # m; what is higher than this over the bed is looked at, in the mask or not
-_REACH = 3  # cells around a peak within which it must be the highest
+_REACH = 2  # cells around a peak within which it must be the highest
 _SMALLEST = 12  # px; images smaller than this in either direction hold no circle
 
 
@@ -80,10 +80,10 @@ class PhaseHough(Stage):
     )
     min_score: float = Field(0.5, ge=0, le=1, description="smallest score that is kept")
     edge: float = Field(
-        0.2, gt=0, le=2, description="least gradient, in units of Otsu's threshold of gradients"
+        0.25, gt=0, le=2, description="least gradient, in units of Otsu's threshold of gradients"
     )
     evidence: float = Field(
-        0.08, ge=0.01, le=1, description="least share of an outline that votes, for a candidate"
+        0.05, ge=0.01, le=1, description="least share of an outline that votes, for a candidate"
     )
     use_depth: bool = Field(True, description="false ignores depth")
     verifier: GraphPath | None = Field(None, description="another verifier than the package's")

@@ -25,6 +25,9 @@ OVAL = 0.07  # of the radius: expected size of p and q
 TURNED = 0.7  # cosine between an edge's normal and the radius
 ALIGNED = 0.8
 PER_DIRECTION = 3
+# Shading inside an outline draws the phase to smaller radii; a second start finds the outer ring.
+STARTS = (1.0, 1.3)
+SAME = 0.04  # of the radius
 STEP_UP = 0.004  # m
 HIDDEN = -3  # in a table of hits: something nearer hides the outline there
 
@@ -239,20 +242,37 @@ def refit(
         Outlines (M, 5), the hits of their directions (M, `DIRECTIONS`), -2 beyond the last
         direction, and the distances of the hits (M,), px.
     """
-    n = len(candidates)
+    n = len(candidates) * len(STARTS)
     shapes, residual = np.empty((n, 5)), np.empty(n, np.float32)
     hits = np.full((n, DIRECTIONS), -2, np.int32)
     rows = np.empty(PER_DIRECTION * DIRECTIONS, np.int32)
     kept = 0
-    for k in range(n):
-        shape = shapes[kept]
-        shape[0], shape[1], shape[2] = candidates[k, 0], candidates[k, 1], candidates[k, 2]
-        shape[3] = shape[4] = 0
-        count = gather(edges, height, step_up(shape[2] * pixel), shape, rows)
-        if count < 6 or not fit_outline(edges, rows, count, shape):
-            continue
-        if not smallest * 0.9 <= shape[2] <= largest * 1.1:
-            continue
-        residual[kept] = outline_hits(edges, shape, hits[kept])[1]
-        kept += 1
+    for start in STARTS:
+        for k in range(len(candidates)):
+            shape = shapes[kept]
+            shape[0], shape[1] = candidates[k, 0], candidates[k, 1]
+            shape[2] = min(largest, start * candidates[k, 2])
+            shape[3] = shape[4] = 0
+            count = gather(edges, height, step_up(shape[2] * pixel), shape, rows)
+            if count < 6 or not fit_outline(edges, rows, count, shape):
+                continue
+            within = smallest * 0.9 <= shape[2] <= largest * 1.1
+            if not within or _known(shape, shapes[:kept]):
+                continue
+            residual[kept] = outline_hits(edges, shape, hits[kept])[1]
+            kept += 1
     return shapes[:kept], hits[:kept], residual[:kept]
+
+
+@jit
+def _known(shape: Shape, others: Table) -> bool:
+    """Whether another outline is the same but for a few per cent."""
+    near = max(0.7, SAME * shape[2])
+    for other in others:
+        if (
+            abs(other[0] - shape[0]) < near
+            and abs(other[1] - shape[1]) < near
+            and abs(other[2] - shape[2]) < near
+        ):
+            return True
+    return False
