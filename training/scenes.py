@@ -17,7 +17,8 @@ CONDITIONS: dict[str, dict[str, Any]] = {
     "gradient": {"light": "gradient", "light_strength": 0.95},
     "dense": {"count": 150, "cluster": 1.0},
     "brown": {"cap_color": "brown"},
-    "tilted": {"tilt_deg": (10, 40), "stumps": 6, "fallen": 3},
+    "tilted": {"tilt_deg": (10, 40), "stumps": 4},
+    "fallen": {"tilt_deg": (10, 40), "stumps": 6, "fallen": 3},
     "mixed": {"cap_color": "mixed"},
     "cream": {"cap_color": "cream", "tray": True},
     "side": {"light": "side"},
@@ -37,13 +38,14 @@ CONDITIONS: dict[str, dict[str, Any]] = {
 TRAINING = {
     "even": 8, "gradient": 5, "dense": 8, "brown": 6, "tilted": 8, "mixed": 4, "cream": 2,
     "side": 3, "spot": 2, "harsh": 4, "near": 4, "far": 3, "oblique": 4, "lab": 4, "cloth": 2,
-    "paint": 2, "empty": 3, "bare": 3,
+    "paint": 2, "empty": 3, "bare": 3, "fallen": 6,
 }  # fmt: skip
 CHOOSING = {
     "even": 3, "gradient": 3, "dense": 3, "brown": 3, "tilted": 4, "harsh": 2, "near": 1,
-    "oblique": 1, "lab": 2, "empty": 1, "bare": 1,
+    "oblique": 1, "lab": 2, "empty": 1, "bare": 1, "fallen": 2,
 }  # fmt: skip
-JUDGED = ("even", "gradient", "dense", "brown", "tilted", "side", "harsh", "lab", "empty", "bare")
+JUDGED = ("even", "gradient", "dense", "brown", "tilted", "side", "harsh", "lab", "empty", "bare",
+          "fallen")  # fmt: skip
 CHOOSING_SEED, JUDGING_SEED = 900, 5000
 
 

@@ -92,7 +92,7 @@ def samples(
         found = stage.gather(frame, mask)
         if found is None or not len(found.shapes):
             continue
-        order, chance = stage.decide(found)
+        order, chance, _ = stage.decide(found)
         circles = Circles(found.shapes[:, :2], equal_area_radius(found.shapes), chance)
         label = labels(case, circles, order)
         use = np.isfinite(label) & (np.isfinite(found.middle) if depth else True)

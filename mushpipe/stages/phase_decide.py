@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
-from mushpipe.stages.phase_edges import Edges, Rows
-from mushpipe.stages.phase_refit import HIDDEN, Shape, Table, gather, tolerance
+from mushpipe.stages.phase_edges import Edges, Plane, Rows
+from mushpipe.stages.phase_refit import HIDDEN, Shape, Table, fit_outline, gather, step_up, tolerance
 
 MARGIN = 1.0  # px; so far within an accepted circle an outline counts as hidden by it
+SHADE = 3.0  # px; so far around an accepted circle, a lower one is shaded
 TAKEN = 2.5  # px; edges so near an accepted outline are its own
 
 
@@ -53,16 +54,17 @@ def overlap_features(shape: Shape, accepted: Table, row: Table) -> None:
 
 
 @jit
-def _covered(x: float, y: float, accepted: Table) -> bool:
+def _covered(x: float, y: float, accepted: Table, margin: float) -> bool:
+    """Whether a point lies within a circle by more than a margin (px)."""
     for other in accepted:
-        if (x - other[0]) ** 2 + (y - other[1]) ** 2 < max(0.0, other[2] - MARGIN) ** 2:
+        if (x - other[0]) ** 2 + (y - other[1]) ** 2 < max(0.0, other[2] - margin) ** 2:
             return True
     return False
 
 
 @jit
 def outline_features(
-    edges: Edges, shape: Shape, hits: Rows, used: NDArray[np.bool_], accepted: Table, row: Table
+    edges: Edges, shape: Shape, hits: Rows, owner: Rows, accepted: Table, row: Table
 ) -> None:
     """Write free, support, trust and hits into row[0..3].
 
@@ -81,11 +83,11 @@ def outline_features(
         inside += 1
         if hits[k] == HIDDEN:
             continue
-        if hits[k] >= 0 and not used[hits[k]]:
+        if hits[k] >= 0 and owner[hits[k]] < 0:
             free += 1
             found += 1
             weight += edges.weight[hits[k]]
-        elif not _covered(x, y, accepted):
+        elif not _covered(x, y, accepted, MARGIN):
             free += 1
     row[0] = free / max(inside, 1)
     row[1] = found / max(free, 1)
@@ -111,7 +113,7 @@ def probability(row: Table, weights: Table) -> float:
 
 
 @jit
-def _use_up(edges: Edges, shape: Shape, used: NDArray[np.bool_], rows: Rows) -> None:
+def _use_up(edges: Edges, shape: Shape, number: int, owner: Rows, rows: Rows) -> None:
     nothing = np.zeros((0, 0), np.float32)
     count = gather(edges, nothing, 0.0, shape, rows)
     near = max(TAKEN, 1.3 * tolerance(shape[2]))
@@ -120,15 +122,15 @@ def _use_up(edges: Edges, shape: Shape, used: NDArray[np.bool_], rows: Rows) -> 
         d = max(1e-6, math.hypot(dx, dy))
         c, s = dx / d, dy / d
         e = d - (shape[2] + shape[3] * (c * c - s * s) + shape[4] * 2 * s * c)
-        if abs(e) < near:
-            used[rows[k]] = True
+        if abs(e) < near and owner[rows[k]] < 0:
+            owner[rows[k]] = number
 
 
 @jit
 def decide(
     edges: Edges, shapes: Table, hits: Rows, table: Table, depth: NDArray[np.bool_],
     image_weights: Table, depth_weights: Table, least: float,
-) -> tuple[Rows, NDArray[np.float64]]:  # fmt: skip
+) -> tuple[Rows, Table, Rows]:  # fmt: skip
     """Accept candidates in the order of their probability.
 
     Args:
@@ -143,10 +145,11 @@ def decide(
         least: Smallest probability that is accepted.
 
     Returns:
-        Rows of the accepted in their order, and the probability of every candidate.
+        Rows of the accepted in their order, the probability of every candidate, and of every edge
+        point the number of the accepted circle that it belongs to, -1 for none.
     """
     n = len(shapes)
-    used = np.zeros(len(edges.x), np.bool_)
+    owner = np.full(len(edges.x), -1, np.int32)
     chance, waiting = np.full(n, -1.0), np.ones(n, np.bool_)
     accepted, order = np.empty((n, 5)), np.empty(n, np.int32)
     rows = np.empty(4096, np.int32)
@@ -157,7 +160,7 @@ def decide(
             # Not only what it used up: what it hides, too, changes the odds of its neighbours.
             if waiting[k] and (count == 0 or _meet(shapes[k], accepted[count - 1])):
                 near = _neighbours(shapes[k], accepted[:count])
-                outline_features(edges, shapes[k], hits[k], used, near, table[k])
+                outline_features(edges, shapes[k], hits[k], owner, near, table[k])
                 overlap_features(shapes[k], near, table[k])
                 chance[k] = probability(table[k], depth_weights if depth[k] else image_weights)
             if waiting[k] and chance[k] >= top:
@@ -166,9 +169,9 @@ def decide(
             break
         waiting[best] = False
         accepted[count], order[count] = shapes[best], best
+        _use_up(edges, shapes[best], count, owner, rows)
         count += 1
-        _use_up(edges, shapes[best], used, rows)
-    return order[:count], chance
+    return order[:count], chance, owner
 
 
 @jit
@@ -189,3 +192,31 @@ def _neighbours(shape: Shape, accepted: Table) -> Table:
             found[count] = other
             count += 1
     return found[:count]
+
+
+@jit
+def polish(edges: Edges, height: Plane, pixel: float, outlines: Table, owner: Rows) -> None:
+    """Refit accepted outlines (K, 5), in their order and in place, to what is theirs alone.
+
+    Edges of others do not count, nor those within or just outside a circle that was accepted
+    before: where a cap dips under another one, its steepest shading is not its outline.
+    """
+    rows, own = np.empty(4096, np.int32), np.empty(4096, np.int32)
+    shape = np.empty(5)
+    for k in range(len(outlines)):
+        shape[:] = outlines[k]
+        near = _neighbours(shape, outlines[:k])
+        count = gather(edges, height, step_up(shape[2] * pixel), shape, rows)
+        kept = 0
+        for m in range(count):
+            row = rows[m]
+            if owner[row] >= 0 and owner[row] != k:
+                continue
+            if not _covered(edges.x[row], edges.y[row], near, -SHADE):
+                own[kept] = row
+                kept += 1
+        moved = fit_outline(edges, own, kept, shape) if kept >= 12 else False
+        limit = max(1.5, 0.15 * outlines[k, 2])
+        if moved and abs(shape[2] - outlines[k, 2]) < limit:
+            if math.hypot(shape[0] - outlines[k, 0], shape[1] - outlines[k, 1]) < limit:
+                outlines[k] = shape

@@ -14,7 +14,7 @@ from pydantic import Field, PrivateAttr, model_validator
 
 from mushpipe import Circles, Mask, RgbdFrame, Stage
 from mushpipe.core.stage import GraphPath
-from mushpipe.stages.phase_decide import decide
+from mushpipe.stages.phase_decide import decide, polish
 from mushpipe.stages.phase_depth import NO_RELIEF, Relief, relief_of
 from mushpipe.stages.phase_edges import (
     Edges,
@@ -50,6 +50,8 @@ class Evidence:
         hits: (N, D) rows of the edges that support each.
         table: (N, F) features.
         middle: (N,) m height of the middle over the bed, NaN without depth.
+        height: (h, w) m over the bed at half resolution, empty without depth.
+        pixel: Size of a pixel on the bed, m.
     """
 
     edges: Edges
@@ -57,6 +59,8 @@ class Evidence:
     hits: Rows
     table: Table
     middle: Table
+    height: Plane
+    pixel: float
 
 
 class PhaseHough(Stage):
@@ -76,7 +80,7 @@ class PhaseHough(Stage):
         description="smallest and largest radius, px; null takes them from diameter_mm and depth",
     )
     diameter_mm: tuple[Positive, Positive] = Field(
-        (10, 120), description="smallest and largest diameter, mm, where there is depth"
+        (8, 120), description="smallest and largest diameter, mm, where there is depth"
     )
     min_score: float = Field(0.5, ge=0, le=1, description="smallest score that is kept")
     edge: float = Field(
@@ -108,8 +112,9 @@ class PhaseHough(Stage):
         found = self.gather(frame, mask)
         if found is None:
             return Circles(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
-        order, chance = self.decide(found)
+        order, chance, owner = self.decide(found)
         shapes = found.shapes[order]
+        polish(found.edges, found.height, found.pixel, shapes, owner)
         return Circles(shapes[:, :2], equal_area_radius(shapes), chance[order])
 
     def gather(self, frame: RgbdFrame, mask: Mask) -> Evidence | None:
@@ -131,10 +136,12 @@ class PhaseHough(Stage):
             image, gradient, mask.foreground.view(np.uint8), high, pixel, shapes, hits, residual
         )
         kept = self._plausible(shapes, middle, relief)
-        return Evidence(edges, shapes[kept], hits[kept], table[kept], middle[kept])
+        return Evidence(
+            edges, shapes[kept], hits[kept], table[kept], middle[kept], high, pixel
+        )
 
-    def decide(self, found: Evidence) -> tuple[Rows, Table]:
-        """Return the accepted rows in their order, and the probability of every candidate."""
+    def decide(self, found: Evidence) -> tuple[Rows, Table, Rows]:
+        """Return the accepted rows in their order, all probabilities, and whose each edge is."""
         verifier = self._load()
         plain = verifier.mask if self.input == "mask" else verifier.image
         known = np.isfinite(found.middle)
