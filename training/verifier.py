@@ -63,7 +63,8 @@ def labels(case: Case, circles: Circles, order: NDArray[np.intp]) -> Floats:
     """Return 1 for right, 0 for wrong, NaN for candidates (N,) that teach nothing.
 
     The first of the accepted candidates (`order`) on a cap is right, all others on it are wrong;
-    where none was accepted, each that fits is right.
+    where none was accepted, each that fits is right. A candidate is wrong, too, where another one
+    fits the cap clearly better.
     """
     truth = case.truth
     cap = (truth.ignore == 0) | np.isin(truth.ignore, RIGHT)
@@ -80,6 +81,9 @@ def labels(case: Case, circles: Circles, order: NDArray[np.intp]) -> Floats:
             result[k] = 0.0 if taken[best] else 1.0
         if best >= 0 and iou[k, best] >= IOU and k in order:
             taken[best] = True
+    best = np.where(cap, iou, 0).max(axis=0, initial=0)
+    worse = (iou >= 0.35) & (iou < best - 0.15) & (best >= 0.65) & cap
+    result[worse.any(axis=1)] = 0.0
     return result
 
 
