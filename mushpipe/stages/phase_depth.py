@@ -114,7 +114,7 @@ def _heights(depth: Plane, plane: NDArray[np.float64]) -> Plane:
 def closed(height: Plane) -> Plane:
     """Close gaps of up to `FILL` px along rows, then columns, by the lower of both ends.
 
-    What hides behind a cap's rim, or in the shadow of the projector, lies low.
+    What hides behind a cap's rim, or in the shadow of the projector, lies low. Wider gaps stay.
     """
     out = height.copy()
     for turn in range(2):
@@ -129,10 +129,6 @@ def closed(height: Plane) -> Plane:
                     for u in range(last + 1, x):
                         view[y, u] = low
                 last = x
-    for y in range(out.shape[0]):
-        for x in range(out.shape[1]):
-            if out[y, x] == np.float32(-1):
-                out[y, x] = 0
     return out
 
 
@@ -152,8 +148,15 @@ class Relief:
         self.pixel = float(np.median(known[:: max(1, len(known) // 2000)])) / focal
 
     def edges(self) -> Edges:
-        """Return the depth discontinuities, in pixels of the height map."""
-        return depth_edges(closed(self.height), STEEP * CELL * self.pixel)
+        """Return the depth discontinuities, in pixels of the height map; `index` is not kept up."""
+        filled = closed(self.height)
+        known = np.maximum(filled, 0)
+        edges = depth_edges(known, STEEP * CELL * self.pixel)
+        # Where depth ends, nothing is known to lie lower.
+        u = np.rint(edges.x - 2.5 * edges.nx).astype(int).clip(0, known.shape[1] - 1)
+        v = np.rint(edges.y - 2.5 * edges.ny).astype(int).clip(0, known.shape[0] - 1)
+        real = filled[v, u] != -1
+        return Edges(*(column[real] for column in edges[:6]), edges.index)
 
 
 def relief_of(frame: RgbdFrame) -> Relief | None:
