@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
 from mushpipe.stages.phase_edges import Edges, Plane, Rows
-from mushpipe.stages.phase_refit import HIDDEN, Shape, Table, fit_outline, gather, step_up, tolerance
+from mushpipe.stages.phase_refit import HIDDEN, Shape, Table, fit_outline, gather, step_up, tolerance, turned
 
 MARGIN = 1.0  # px; so far within an accepted circle an outline counts as hidden by it
 SHADE = 3.0  # px; so far around an accepted circle, a lower one is shaded
@@ -75,9 +75,11 @@ def outline_features(
     n, inside, free, found, weight = 0, 0, 0, 0, 0.0
     while n < len(hits) and hits[n] != -2:
         n += 1
+    cosine, sine = math.cos(2 * math.pi / max(n, 1)), math.sin(2 * math.pi / max(n, 1))
+    c, s = cosine, -sine
     for k in range(n):
-        t = 2 * math.pi * k / n
-        x, y = shape[0] + shape[2] * math.cos(t), shape[1] + shape[2] * math.sin(t)
+        c, s = turned(c, s, cosine, sine)
+        x, y = shape[0] + shape[2] * c, shape[1] + shape[2] * s
         if x < 0 or y < 0 or x > width - 1 or y > height - 1:
             continue
         inside += 1
@@ -115,7 +117,7 @@ def probability(row: Table, weights: Table) -> float:
 @jit
 def _use_up(edges: Edges, shape: Shape, number: int, owner: Rows, rows: Rows) -> None:
     nothing = np.zeros((0, 0), np.float32)
-    count = gather(edges, nothing, 0.0, shape, rows)
+    count = gather(edges, nothing, 0.0, shape, 1, rows)
     near = max(TAKEN, 1.3 * tolerance(shape[2]))
     for k in range(count):
         dx, dy = edges.x[rows[k]] - shape[0], edges.y[rows[k]] - shape[1]
@@ -206,7 +208,7 @@ def polish(edges: Edges, height: Plane, pixel: float, outlines: Table, owner: Ro
     for k in range(len(outlines)):
         shape[:] = outlines[k]
         near = _neighbours(shape, outlines[:k])
-        count = gather(edges, height, step_up(shape[2] * pixel), shape, rows)
+        count = gather(edges, height, step_up(shape[2] * pixel), shape, 1, rows)
         kept = 0
         for m in range(count):
             row = rows[m]
@@ -215,7 +217,7 @@ def polish(edges: Edges, height: Plane, pixel: float, outlines: Table, owner: Ro
             if not _covered(edges.x[row], edges.y[row], near, -SHADE):
                 own[kept] = row
                 kept += 1
-        moved = fit_outline(edges, own, kept, shape) if kept >= 12 else False
+        moved = fit_outline(edges, own, kept, shape, 1) if kept >= 12 else False
         limit = max(1.5, 0.15 * outlines[k, 2])
         if moved and abs(shape[2] - outlines[k, 2]) < limit:
             if math.hypot(shape[0] - outlines[k, 0], shape[1] - outlines[k, 1]) < limit:

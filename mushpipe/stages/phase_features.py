@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
 from mushpipe.stages.phase_edges import Gradient, Plane, Rows
-from mushpipe.stages.phase_refit import HIDDEN, Shape, Table, height_at, rise, step_up
+from mushpipe.stages.phase_refit import HIDDEN, Shape, Table, height_at, rise, step_up, turned
 
 Bytes = NDArray[np.uint8]
 
@@ -45,6 +45,7 @@ DEPTH_FEATURES = {
 NAMES = (*IMAGE_FEATURES, *DEPTH_FEATURES)
 FIRST_STATIC = list(NAMES).index("residual")
 FIRST_DEPTH = len(IMAGE_FEATURES)
+GRID = 4  # the surface is sampled at up to (2 GRID + 1)^2 points
 SAMPLES = 16  # directions in which the disc is sampled
 LEAST_KNOWN = 0.35  # share of the disc with depth below which depth features are off
 _RINGS = np.array([0.15, 0.3, 0.45, 0.6, 0.75, 0.88, 0.97])
@@ -126,7 +127,7 @@ def _quadric(
     On entry `b` is the previous solution, from which far points (beyond 3 sigma) are left out
     unless sigma is 0; on return the right side. Returns numbers of points with and without depth.
     """
-    n, known, unknown = 6, 0, 0
+    n, known, unknown = GRID, 0, 0
     before = b.copy()
     a[:] = 0
     b[:] = 0
@@ -155,7 +156,7 @@ def _quadric(
 @jit
 def _misfit(height: Plane, shape: Shape, b: Table) -> float:
     """Return the root mean square residual of a quadric, m; each clipped to 0.3 of the radius."""
-    n, count, total = 6, 0, 0.0
+    n, count, total = GRID, 0, 0.0
     for i in range(-n, n + 1):
         for j in range(-n, n + 1):
             u, v = 0.75 * i / n, 0.75 * j / n
@@ -209,8 +210,10 @@ def edge_features(height: Plane, shape: Shape, pixel: float, hits: Rows, row: Ta
     n, known, lower, higher = 0, 0, 0, 0
     while n < len(hits) and hits[n] != -2:
         n += 1
+    cosine, sine = math.cos(2 * math.pi / max(n, 1)), math.sin(2 * math.pi / max(n, 1))
+    c, s = cosine, -sine
     for k in range(n):
-        c, s = math.cos(2 * math.pi * k / n), math.sin(2 * math.pi * k / n)
+        c, s = turned(c, s, cosine, sine)
         up = rise(height, shape[0], shape[1], c, s, shape[2])
         if up == 0:
             continue
