@@ -11,6 +11,7 @@ def mushpipe_register(registry: Registry) -> None:
     registry.stage("otsu", "mushpipe.stages.otsu:Otsu")
     registry.stage("chan-vese", "mushpipe.stages.chan_vese:ChanVese")
     registry.stage("opening", "mushpipe.stages.opening:Opening")
+    registry.stage("phase-hough", "mushpipe.stages.phase_hough:PhaseHough")
     registry.stage("hough", "mushpipe.stages.hough:Hough")
     registry.stage("nearest-depth", "mushpipe.stages.nearest_depth:NearestDepth")
     registry.stage("picks", "mushpipe.stages.picks:MakePicks")

@@ -84,7 +84,8 @@ def reliability(score: Score, bins: int = 5) -> str:
     for low in np.linspace(0.5, 1, bins, endpoint=False):
         part = values[(values[:, 0] >= low) & (values[:, 0] < low + 0.5 / bins + 1e-9)]
         if len(part):
-            lines.append(f"  score {part[:, 0].mean():.2f}: right {part[:, 1].mean():.2f} of {len(part)}")  # fmt: skip
+            score, right = part.mean(axis=0)
+            lines.append(f"  score {score:.2f}: right {right:.2f} of {len(part)}")
     return "\n".join(lines)
 
 
@@ -97,13 +98,13 @@ def main() -> None:
     arguments = parser.parse_args()
     cases = (choosing_cases if arguments.choosing else judging_cases)(arguments.cache)
     scores = judge(cases, arguments.detectors)
-    print(table(scores, arguments.detectors))  # noqa: T201
+    print(table(scores, arguments.detectors))
     for name in arguments.detectors:
         whole = Score()
         for (_, detector), score in scores.items():
             if detector == name:
                 whole.merge(score)
-        print(name, reliability(whole), sep="\n")  # noqa: T201
+        print(name, reliability(whole), sep="\n")
 
 
 if __name__ == "__main__":

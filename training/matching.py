@@ -62,9 +62,7 @@ class Score:
         self.false += len(wrong)
         away = np.linalg.norm(circles.center[rows] - truth.center[columns], axis=1)
         larger = circles.radius[rows] - truth.radius[columns]
-        self.errors += zip(
-            away, larger, truth.visible[columns], truth.radius[columns], strict=True
-        )
+        self.errors += zip(away, larger, truth.visible[columns], truth.radius[columns], strict=True)
         self.reliability += [(s, 1.0) for s in circles.score[rows]]
         self.reliability += [(s, 0.0) for s in circles.score[wrong]]
 

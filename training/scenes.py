@@ -64,7 +64,7 @@ def render(condition: str, family: str, seed: int, cache: Path) -> Case:
     """Return a frame, from the cache folder where it was rendered before."""
     path = cache / f"{condition}-{family}-{seed}.pickle"
     if path.exists():
-        case: Case = pickle.loads(path.read_bytes())  # noqa: S301 - written by this function
+        case: Case = pickle.loads(path.read_bytes())
         return case
     settings = CONDITIONS[condition] | {"seed": seed, "shape_family": family, "max_frames": 1}
     frame = next(iter(SyntheticSource(**settings).frames()))

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import expit
@@ -23,7 +22,7 @@ from mushpipe.stages.chan_vese import ChanVese
 from mushpipe.stages.flatten import Flatten
 from mushpipe.stages.opening import Opening
 from mushpipe.stages.otsu import Otsu
-from mushpipe.stages.phase_features import DEPTH_FEATURES, IMAGE_FEATURES, NAMES
+from mushpipe.stages.phase_features import IMAGE_FEATURES, NAMES
 from mushpipe.stages.phase_hough import PhaseHough, equal_area_radius
 from mushpipe.stages.verifier import COLUMNS
 from training.matching import IOU, circle_iou
@@ -125,15 +124,15 @@ def fit(features: Floats, right: Floats, names: tuple[str, ...], ridge: float) -
 
     w = minimize(loss, np.zeros(basis.shape[1]), jac=True, method="L-BFGS-B").x
     first, second = w[1 : 1 + len(names)], w[1 + len(names) :]
-    columns = [[round(float(v), 4) for v in row] for row in zip(mean, scale, first, second)]
-    values = {n: dict(zip(COLUMNS, row)) for n, row in zip(names, columns)}
+    table = np.column_stack([mean, scale, first, second]).round(4).tolist()
+    values = {n: dict(zip(COLUMNS, row, strict=True)) for n, row in zip(names, table, strict=True)}
     return {"intercept": round(float(w[0]), 4), "features": values}
 
 
 def first_guess() -> dict[str, Any]:
     """Return a model to start from: edges count for, hidden outline and overlap against."""
     weights = {"support": 6.0, "free": 2.0, "coherence": 3.0, "overlap": -3.0}
-    features = {n: dict(zip(COLUMNS, (0.5, 1.0, w, 0.0))) for n, w in weights.items()}
+    features = {n: dict(zip(COLUMNS, (0.5, 1.0, w, 0.0), strict=True)) for n, w in weights.items()}
     return {"intercept": 0.0, "features": features}
 
 
@@ -143,7 +142,8 @@ def write(models: dict[str, Any], path: Path) -> None:
     for name, model in models.items():
         lines += [f"  {name}:", f"    intercept: {model['intercept']}", "    features:"]
         for feature, values in model["features"].items():
-            lines.append(f"      {feature}: {yaml.safe_dump(values, default_flow_style=True, sort_keys=False, width=200).strip()}")  # fmt: skip
+            text = ", ".join(f"{column}: {value}" for column, value in values.items())
+            lines.append(f"      {feature}: {{{text}}}")
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
@@ -161,7 +161,7 @@ def train(cache: Path, out: Path, rounds: int, ridge: float) -> None:
             stage = PhaseHough(radius_px=RADII, verifier=out, **settings)
             features, right = samples(stage, cases, name == "depth")
             models[name] = fit(features, right, FEATURES[name], ridge)
-            print(f"round {turn + 1}, {name}: {len(right)} candidates, {right.mean():.2f} right")  # noqa: T201
+            print(f"round {turn + 1}, {name}: {len(right)} candidates, {right.mean():.2f} right")
         write(models, out)
 
 

@@ -14,7 +14,16 @@ from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
 from mushpipe.stages.phase_edges import Edges, Plane, Rows
-from mushpipe.stages.phase_refit import HIDDEN, Shape, Table, fit_outline, gather, step_up, tolerance, turned
+from mushpipe.stages.phase_refit import (
+    HIDDEN,
+    Shape,
+    Table,
+    fit_outline,
+    gather,
+    step_up,
+    tolerance,
+    turned,
+)
 
 MARGIN = 1.0  # px; so far within an accepted circle an outline counts as hidden by it
 SHADE = 3.0  # px; so far around an accepted circle, a lower one is shaded
@@ -71,7 +80,7 @@ def outline_features(
     A direction is hidden where depth says so (`HIDDEN`), or where it lies within an accepted circle
     and has no edge of its own left.
     """
-    height, width = edges.index.shape
+    height, width = edges.pixels.shape
     n, inside, free, found, weight = 0, 0, 0, 0, 0.0
     while n < len(hits) and hits[n] != -2:
         n += 1
@@ -219,6 +228,6 @@ def polish(edges: Edges, height: Plane, pixel: float, outlines: Table, owner: Ro
                 kept += 1
         moved = fit_outline(edges, own, kept, shape, 1) if kept >= 12 else False
         limit = max(1.5, 0.15 * outlines[k, 2])
-        if moved and abs(shape[2] - outlines[k, 2]) < limit:
-            if math.hypot(shape[0] - outlines[k, 0], shape[1] - outlines[k, 1]) < limit:
-                outlines[k] = shape
+        away = math.hypot(shape[0] - outlines[k, 0], shape[1] - outlines[k, 1])
+        if moved and abs(shape[2] - outlines[k, 2]) < limit and away < limit:
+            outlines[k] = shape

@@ -81,8 +81,9 @@ def bed_plane(depth: Plane) -> NDArray[np.float64] | None:
     cells = _far_cells(depth)
     if len(cells) < 6:
         return None
-    basis = np.column_stack([np.ones(len(cells)), cells[:, :2]])
-    far, weight = cells[:, 2], np.ones(len(cells))
+    basis: NDArray[Any] = np.column_stack([np.ones(len(cells)), cells[:, :2]])
+    far = cells[:, 2]
+    weight: NDArray[Any] = np.ones(len(cells))
     solution = np.zeros(3)
     for _ in range(10):
         weighted = basis * weight[:, None]
@@ -148,7 +149,7 @@ class Relief:
         self.pixel = float(np.median(known[:: max(1, len(known) // 2000)])) / focal
 
     def edges(self) -> Edges:
-        """Return the depth discontinuities, in pixels of the height map; `index` is not kept up."""
+        """Return the depth discontinuities, in px of the height map; `pixels` is not kept up."""
         filled = closed(self.height)
         known = np.maximum(filled, 0)
         edges = depth_edges(known, STEEP * CELL * self.pixel)
@@ -156,7 +157,8 @@ class Relief:
         u = np.rint(edges.x - 2.5 * edges.nx).astype(int).clip(0, known.shape[1] - 1)
         v = np.rint(edges.y - 2.5 * edges.ny).astype(int).clip(0, known.shape[0] - 1)
         real = filled[v, u] != -1
-        return Edges(*(column[real] for column in edges[:6]), edges.index)
+        kept = [column[real] for column in edges[:6]]
+        return Edges(kept[0], kept[1], kept[2], kept[3], kept[4], kept[5], edges.pixels)
 
 
 def relief_of(frame: RgbdFrame) -> Relief | None:

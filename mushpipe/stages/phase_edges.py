@@ -1,4 +1,4 @@
-"""Thin sub-pixel edges: gradients of a Gaussian, an adaptive threshold, maxima along the gradient."""
+"""Thin sub-pixel edges: gradients, an adaptive threshold, and maxima along the gradient."""
 
 from __future__ import annotations
 
@@ -13,9 +13,7 @@ Plane = NDArray[np.float32]
 Singles = NDArray[np.float32]
 Rows = NDArray[np.int32]
 SIGMA = 1.1
-UNCONFIRMED = 0.4  # weight of a gray edge without, and of a depth edge without the other
-DEPTH_ALONE = 0.6
-DEPTH_OUTWARD = 0.6  # px; a depth camera loses that much of a surface at its edge
+DEPTH_ALONE = 0.6  # weight of a depth edge without a gray one
 # Between two caps the steepest step lies within the shaded rim, not on the outline. How far within
 # depends on how bright it is outside, over inside: fitted to the simulator's outlines.
 DIM, BRIGHT, SHIFT = 0.25, 0.8, 2.3
@@ -51,7 +49,7 @@ class Edges(NamedTuple):
         ny: (M,)
         strength: (M,) gradient over the threshold, at least 1.
         weight: (M,) how far its place can be trusted, 0..1; depth edges less than gray ones.
-        index: (H, W) row of the edge point at a pixel, -1 for none.
+        pixels: (H, W) row of the edge point at a pixel, -1 for none.
     """
 
     x: Singles
@@ -60,7 +58,7 @@ class Edges(NamedTuple):
     ny: Singles
     strength: Singles
     weight: Singles
-    index: Rows
+    pixels: Rows
 
 
 @jit
@@ -125,7 +123,7 @@ def otsu_of(size: Plane, top: float) -> float:
         between = (mean * weight / total - first) ** 2 / (weight * (total - weight))
         if between > best:
             best, threshold = between, k
-    return (threshold + 1) / scale
+    return float((threshold + 1) / scale)
 
 
 @jit
@@ -141,7 +139,7 @@ def _at(plane: Plane, x: float, y: float) -> float:
 @jit
 def _within(plane: Plane, x: float, y: float) -> tuple[float, float]:
     right, bottom = plane.shape[1] - 1.001, plane.shape[0] - 1.001
-    return min(max(x, 0.0), right), min(max(y, 0.0), bottom)
+    return float(min(max(x, 0.0), right)), float(min(max(y, 0.0), bottom))
 
 
 @jit
@@ -183,7 +181,7 @@ def thin(
                 continue
             nx, ny = gx[y, x] / m, gy[y, x] / m
             # most pixels lie on a slope that goes on: one look ahead spares the interpolation
-            if size[y + int(round(ny)), x + int(round(nx))] > 1.1 * m:
+            if size[y + round(ny), x + round(nx)] > 1.1 * m:
                 continue
             ahead = _at(size, x + nx, y + ny)
             behind = _at(size, x - nx, y - ny)
@@ -230,9 +228,7 @@ def edges_of(
 def depth_edges(height: Plane, threshold: float) -> Edges:
     """Return the thin edges of a height map (H, W), all of the same weight."""
     region = np.ones(height.shape, np.uint8)
-    x, y, nx, ny, strength, _, index = _thin_edges(
-        height, gradient_of(height), region, threshold
-    )
+    x, y, nx, ny, strength, _, index = _thin_edges(height, gradient_of(height), region, threshold)
     return Edges(x, y, nx, ny, strength, np.full(len(x), DEPTH_ALONE, np.float32), index)
 
 
@@ -244,83 +240,3 @@ def _thin_edges(
     count = thin(image, *grad, region, threshold, points, index)
     x, y, nx, ny, strength, bright = np.ascontiguousarray(points[:count].T)
     return x, y, nx, ny, strength, bright, index
-
-
-@jit
-def confirm(
-    x: Singles, y: Singles, nx: Singles, ny: Singles, gray: Edges, trust: Singles, reach: int
-) -> NDArray[np.bool_]:
-    """Give the gray edges that a depth edge runs along their trust; return the edges without one.
-
-    Args:
-        x: (M,) px, depth edges in the pixels of the image.
-        y: (M,) px.
-        nx: (M,) unit normals.
-        ny: (M,)
-        gray: Edges whose weight is raised.
-        trust: (N,) to what it is raised.
-        reach: How far (px) a gray edge may lie from its depth edge.
-
-    Returns:
-        (M,) True where there is no better gray edge of about the same direction.
-    """
-    height, width = gray.index.shape
-    alone = np.ones(len(x), np.bool_)
-    for k in range(len(x)):
-        u, v = int(x[k] + 0.5), int(y[k] + 0.5)
-        for row in range(max(v - reach, 0), min(v + reach + 1, height)):
-            for column in range(max(u - reach, 0), min(u + reach + 1, width)):
-                j = gray.index[row, column]
-                if j < 0 or nx[k] * gray.nx[j] + ny[k] * gray.ny[j] < 0.8:
-                    continue
-                if trust[j] > DEPTH_ALONE:
-                    alone[k] = False
-                gray.weight[j] = trust[j]
-    return alone
-
-
-@jit
-def enter(index: Rows, x: Singles, y: Singles, rows: Rows) -> None:
-    """Enter edge points into the index: over what is there, and where it is empty next to them.
-
-    Points of a coarser grid leave gaps, through which a ray across the outline would slip.
-    """
-    for k in range(len(x)):
-        index[int(y[k] + 0.5), int(x[k] + 0.5)] = rows[k]
-    for k in range(len(x)):
-        u, v = int(x[k] + 0.5), int(y[k] + 0.5)
-        for row in range(max(v - 1, 0), min(v + 2, index.shape[0])):
-            for column in range(max(u - 1, 0), min(u + 2, index.shape[1])):
-                if index[row, column] < 0:
-                    index[row, column] = rows[k]
-
-
-def fused(gray: Edges, depth: Edges, scale: float) -> Edges:
-    """Return gray edges, and the depth edges that lie where there is no gray one.
-
-    A gray edge without a depth edge beside it may be a shadow, dirt or shading: it weighs less.
-
-    Args:
-        gray: Edges of the image.
-        depth: Edges of a height map.
-        scale: Size of a pixel of the height map in image pixels.
-    """
-    half = np.float32(0.5)
-    x = (depth.x + half) * np.float32(scale) - half - np.float32(DEPTH_OUTWARD) * depth.nx
-    y = (depth.y + half) * np.float32(scale) - half - np.float32(DEPTH_OUTWARD) * depth.ny
-    weight = gray.weight * np.float32(UNCONFIRMED)
-    raised = gray._replace(weight=weight)
-    alone = confirm(x, y, depth.nx, depth.ny, raised, gray.weight, 3)
-    height, width = gray.index.shape
-    alone &= (x >= 0) & (y >= 0) & (x < width - 1) & (y < height - 1)
-    rows = np.arange(len(gray.x), len(gray.x) + int(alone.sum()), dtype=np.int32)
-    enter(gray.index, x[alone], y[alone], rows)
-    return Edges(
-        np.concatenate([gray.x, x[alone]]),
-        np.concatenate([gray.y, y[alone]]),
-        np.concatenate([gray.nx, depth.nx[alone]]),
-        np.concatenate([gray.ny, depth.ny[alone]]),
-        np.concatenate([gray.strength, depth.strength[alone]]),
-        np.concatenate([weight, depth.weight[alone]]),
-        gray.index,
-    )

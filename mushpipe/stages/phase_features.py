@@ -54,7 +54,7 @@ _RINGS = np.array([0.15, 0.3, 0.45, 0.6, 0.75, 0.88, 0.97])
 @jit
 def _pixel(x: float, y: float, width: int, height: int) -> tuple[int, int]:
     """Nearest pixel; x = -1 beyond the image."""
-    u, v = int(math.floor(x + 0.5)), int(math.floor(y + 0.5))
+    u, v = math.floor(x + 0.5), math.floor(y + 0.5)
     if u < 0 or v < 0 or u >= width or v >= height:
         return -1, -1
     return u, v
@@ -119,13 +119,12 @@ def contrast_features(image: Plane, shape: Shape, row: Table) -> None:
 
 
 @jit
-def _quadric(
-    height: Plane, shape: Shape, sigma: float, a: Table, b: Table
-) -> tuple[int, int]:
-    """Gather the normal equations of z = b0 + b1 u + b2 v + b3 u^2 + b4 u v + b5 v^2, u, v in radii.
+def _quadric(height: Plane, shape: Shape, sigma: float, a: Table, b: Table) -> tuple[int, int]:
+    """Gather the normal equations of z = b0 + b1 u + b2 v + b3 u^2 + b4 u v + b5 v^2.
 
-    On entry `b` is the previous solution, from which far points (beyond 3 sigma) are left out
-    unless sigma is 0; on return the right side. Returns numbers of points with and without depth.
+    Coordinates u, v are in radii. On entry `b` is the previous solution, from which far points
+    (beyond 3 sigma) are left out unless sigma is 0; on return it is the right side. Returns the
+    numbers of points with and without depth.
     """
     n, known, unknown = GRID, 0, 0
     before = b.copy()

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import cv2
@@ -22,11 +20,11 @@ from mushpipe.stages.phase_edges import (
     Plane,
     Rows,
     edges_of,
-    fused,
     gradient_of,
     otsu_of,
 )
 from mushpipe.stages.phase_features import static_features
+from mushpipe.stages.phase_fuse import fused
 from mushpipe.stages.phase_refit import Table, refit
 from mushpipe.stages.phase_votes import CELL, peaks, rings_between, summed, vote
 from mushpipe.stages.verifier import Verifier, load_verifier
@@ -128,7 +126,9 @@ class PhaseHough(Stage):
         image = _levels(frame, mask, literal)
         gradient = gradient_of(image)
         edges = self._edges(image, gradient, _region(mask, relief, literal), relief)
-        cells = vote(edges, rings_between(smallest, largest), (-(-height // CELL), -(-width // CELL)))
+        cells = vote(
+            edges, rings_between(smallest, largest), (-(-height // CELL), -(-width // CELL))
+        )
         found = peaks(*summed(cells), self.evidence, smallest, largest, _REACH)
         high, pixel = (relief.height, relief.pixel) if relief else (NO_RELIEF, 0.0)
         shapes, hits, residual = refit(edges, high, pixel, found, smallest, largest)
@@ -136,9 +136,7 @@ class PhaseHough(Stage):
             image, gradient, mask.foreground.view(np.uint8), high, pixel, shapes, hits, residual
         )
         kept = self._plausible(shapes, middle, relief)
-        return Evidence(
-            edges, shapes[kept], hits[kept], table[kept], middle[kept], high, pixel
-        )
+        return Evidence(edges, shapes[kept], hits[kept], table[kept], middle[kept], high, pixel)
 
     def decide(self, found: Evidence) -> tuple[Rows, Table, Rows]:
         """Return the accepted rows in their order, all probabilities, and whose each edge is."""
@@ -172,9 +170,7 @@ class PhaseHough(Stage):
         edges = edges_of(image, gradient, region, self.edge * otsu, 1.2 * otsu)
         return fused(edges, relief.edges(), CELL) if relief else edges
 
-    def _plausible(
-        self, shapes: Table, middle: Table, relief: Relief | None
-    ) -> NDArray[np.bool_]:
+    def _plausible(self, shapes: Table, middle: Table, relief: Relief | None) -> NDArray[np.bool_]:
         """Return which candidates have a possible diameter in metres, or none that is known."""
         inside = np.ones(len(shapes), bool)
         if relief is not None:

@@ -2,8 +2,8 @@
 
 The outline is r(t) = r + p cos 2t + q sin 2t around the centre: a circle, and to first order the
 ellipse of a tilted cap. Its five parameters minimise the distances of the edge points along the
-radius by Gauss-Newton with the weights of Geman & McClure (1987), on fewer and fewer far points. The
-circle of the same area has the radius sqrt(r^2 + (p^2 + q^2) / 2).
+radius by Gauss-Newton with the weights of Geman & McClure (1987), on fewer and fewer far points.
+The circle of the same area has the radius sqrt(r^2 + (p^2 + q^2) / 2).
 """
 
 from __future__ import annotations
@@ -86,9 +86,7 @@ def rise(height: Plane, x: float, y: float, c: float, s: float, radius: float) -
 
 
 @jit
-def gather(
-    edges: Edges, height: Plane, step: float, shape: Shape, coarse: int, rows: Rows
-) -> int:
+def gather(edges: Edges, height: Plane, step: float, shape: Shape, coarse: int, rows: Rows) -> int:
     """Write the rows of edge points around an outline that face its centre; return their number.
 
     Along each direction the pixels within `REACH` of the outline are looked at, and up to
@@ -96,7 +94,7 @@ def gather(
     something nearer hides the outline. `coarse` is by how much fewer directions are looked at.
     """
     x, y, radius = shape[0], shape[1], shape[2]
-    lines, width = edges.index.shape
+    lines, width = edges.pixels.shape
     count, n = 0, max(20, directions_of(radius) // coarse)
     reach = max(3.0, REACH * radius)
     cosine, sine = math.cos(2 * math.pi / n), math.sin(2 * math.pi / n)
@@ -111,7 +109,7 @@ def gather(
             u, v = int(x + t * c + 0.5), int(y + t * s + 0.5)
             if t < 1 or u < 0 or v < 0 or u >= width or v >= lines:
                 continue
-            row = edges.index[v, u]
+            row = edges.pixels[v, u]
             if row < 0 or row == last or -(c * edges.nx[row] + s * edges.ny[row]) < TURNED:
                 continue
             last = row
@@ -211,7 +209,7 @@ def outline_hits(edges: Edges, shape: Shape, hits: Rows) -> tuple[int, int, floa
     Returns:
         The number of directions, of hits, and the root mean square distance of the hits (px).
     """
-    height, width = edges.index.shape
+    height, width = edges.pixels.shape
     x, y, r = shape[0], shape[1], shape[2]
     n, near = directions_of(r), tolerance(r)
     found, squares = 0, 0.0
@@ -226,7 +224,7 @@ def outline_hits(edges: Edges, shape: Shape, hits: Rows) -> tuple[int, int, floa
             u, v = int(x + t * c + 0.5), int(y + t * s + 0.5)
             if u < 0 or v < 0 or u >= width or v >= height:
                 continue
-            row = edges.index[v, u]
+            row = edges.pixels[v, u]
             if row < 0 or -(c * edges.nx[row] + s * edges.ny[row]) < ALIGNED:
                 continue
             away = abs((edges.x[row] - x) * c + (edges.y[row] - y) * s - radius)
