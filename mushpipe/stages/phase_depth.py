@@ -44,14 +44,17 @@ def halved(depth: NDArray[Any], scale: float) -> Plane:
 
 @jit
 def _far_cells(depth: Plane) -> NDArray[np.float64]:
-    """Return (M, 3): x, y in -0.5..0.5 and the third farthest of every cell's sampled depths."""
+    """Return (M, 3): x, y in -0.5..0.5 and depth of the third farthest sample of every cell.
+
+    Its own place, not the cell's middle, since on a slope the far side of a cell lies off it.
+    """
     height, width = depth.shape
     found = np.empty(((height // GRID + 1) * (width // GRID + 1), 3))
     count = 0
     for top in range(0, height - GRID + 1, GRID):
         for left in range(0, width - GRID + 1, GRID):
             a = b = c = np.float32(0)
-            known = 0
+            known = at_a = at_b = at_c = 0
             for y in range(top, top + GRID, 2):
                 for x in range(left, left + GRID, 2):
                     value = depth[y, x]
@@ -60,13 +63,15 @@ def _far_cells(depth: Plane) -> NDArray[np.float64]:
                     known += 1
                     if value > a:
                         a, b, c = value, a, b
+                        at_a, at_b, at_c = y * width + x, at_a, at_b
                     elif value > b:
                         b, c = value, b
+                        at_b, at_c = y * width + x, at_b
                     elif value > c:
-                        c = value
+                        c, at_c = value, y * width + x
             if known >= GRID:
-                found[count, 0] = (left + GRID / 2) / width - 0.5
-                found[count, 1] = (top + GRID / 2) / height - 0.5
+                found[count, 0] = (at_c % width + 0.5) / width - 0.5
+                found[count, 1] = (at_c // width + 0.5) / height - 0.5
                 found[count, 2] = c
                 count += 1
     return found[:count]

@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from mushpipe import Camera, Circles, Mask, RgbdFrame
-from mushpipe.core.plugins import load_plugins
+from mushpipe import Circles, Mask, RgbdFrame
+from mushpipe.core.plugins import load_registry
 from mushpipe.stages.phase_hough import PhaseHough
-from tests.stages.scenes import CAMERA, HEADER, discs, frame_of, sphere_depth
+from tests.stages.scenes import HEADER, discs, frame_of, sphere_depth
 
 TRUTH = [(40.3, 41.7, 15.2), (100.6, 70.1, 20.7), (128.2, 25.9, 12.4)]
 
@@ -66,10 +66,10 @@ def test_edges_explained_by_one_circle_support_no_second_one() -> None:
 
 def test_a_tilted_cap_gives_the_circle_of_the_same_area() -> None:
     v, u = np.mgrid[:120, :160].astype(float)
-    level = np.hypot((u - 80) / 24, (v - 60) / 18)
+    level = np.hypot((u - 80) / 23, (v - 60) / 19)
     image = 0.15 + 0.65 / (1 + np.exp((level - 1) * 18 / 0.4))
     rows = as_rows(found(image))
-    assert rows[0] == pytest.approx((80, 60, np.sqrt(24 * 18)), abs=0.3)
+    assert rows[0] == pytest.approx((80, 60, np.sqrt(23 * 19)), abs=0.3)
 
 
 @pytest.mark.parametrize("level", [0.0, 0.4, 1.0])
@@ -121,7 +121,6 @@ def test_depth_removes_a_painted_disc_and_keeps_a_sphere() -> None:
     ball = ((110 - 79.5) / 200 * 0.4, (60 - 59.5) / 200 * 0.4, 0.4)
     depth = sphere_depth(ball, 0.04, 0.4)
     image = discs([(40, 60, 20)], 0.8, 0.15)
-    v, u = np.mgrid[:120, :160].astype(float)
     image = np.where(depth < 0.399, 0.8, image)
     assert len(found(image)) == 2
     circles = found(image, depth)
@@ -153,6 +152,4 @@ def test_ranges_the_wrong_way_round_are_refused() -> None:
 
 
 def test_it_is_registered() -> None:
-    assert Camera is not None
-    assert CAMERA.width == 160
-    assert load_plugins is not None
+    assert "phase-hough" in load_registry().names("stage")
