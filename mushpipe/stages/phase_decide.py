@@ -27,6 +27,7 @@ from mushpipe.stages.phase_refit import (
 
 MARGIN = 1.0  # px; so far within an accepted circle an outline counts as hidden by it
 SHADE = 3.0  # px; so far around an accepted circle, a lower one is shaded
+HOPELESS = 0.002  # probability from which on nothing that is accepted later can help
 TAKEN = 2.5  # px; edges so near an accepted outline are its own
 
 
@@ -161,7 +162,7 @@ def decide(
     """
     n = len(shapes)
     owner = np.full(len(edges.x), -1, np.int32)
-    chance, waiting = np.full(n, -1.0), np.ones(n, np.bool_)
+    chance, waiting = np.ones(n), np.ones(n, np.bool_)
     accepted, order = np.empty((n, 5)), np.empty(n, np.int32)
     rows = np.empty(4096, np.int32)
     count = 0
@@ -169,7 +170,8 @@ def decide(
         best, top = -1, least
         for k in range(n):
             # Not only what it used up: what it hides, too, changes the odds of its neighbours.
-            if waiting[k] and (count == 0 or _meet(shapes[k], accepted[count - 1])):
+            alive = waiting[k] and chance[k] > HOPELESS
+            if alive and (count == 0 or _meet(shapes[k], accepted[count - 1])):
                 near = _neighbours(shapes[k], accepted[:count])
                 outline_features(edges, shapes[k], hits[k], owner, near, table[k])
                 overlap_features(shapes[k], near, table[k])

@@ -137,9 +137,10 @@ def _at(plane: Plane, x: float, y: float) -> float:
 
 
 @jit
-def _within(plane: Plane, x: float, y: float) -> tuple[float, float]:
-    right, bottom = plane.shape[1] - 1.001, plane.shape[0] - 1.001
-    return float(min(max(x, 0.0), right)), float(min(max(y, 0.0), bottom))
+def _near(plane: Plane, x: float, y: float) -> float:
+    """Value of the nearest pixel of the image."""
+    u = min(max(int(x + 0.5), 0), plane.shape[1] - 1)
+    return float(plane[min(max(int(y + 0.5), 0), plane.shape[0] - 1), u])
 
 
 @jit
@@ -194,10 +195,10 @@ def thin(
             points[count, 0], points[count, 1] = x + t * nx, y + t * ny
             points[count, 2], points[count, 3] = nx, ny
             points[count, 4] = m / threshold
-            inside = _at(image, *_within(image, x + 3 * nx, y + 3 * ny))
+            inside = _near(image, x + 3 * nx, y + 3 * ny)
             outside = min(
-                _at(image, *_within(image, x - 2.5 * nx, y - 2.5 * ny)),
-                _at(image, *_within(image, x - 3.5 * nx, y - 3.5 * ny)),
+                _near(image, x - 2.5 * nx, y - 2.5 * ny),
+                _near(image, x - 3.5 * nx, y - 3.5 * ny),
             )
             points[count, 5] = max(outside, 0.0) / max(inside, 1e-3)
             index[y, x] = count
@@ -236,7 +237,7 @@ def _thin_edges(
     image: Plane, grad: Gradient, region: NDArray[np.uint8], threshold: float
 ) -> tuple[Singles, Singles, Singles, Singles, Singles, Singles, Rows]:
     index = np.full(image.shape, -1, np.int32)
-    points = np.empty((image.size // 3 + 1, 6), np.float32)
+    points = np.empty((image.size // 6 + 16, 6), np.float32)
     count = thin(image, *grad, region, threshold, points, index)
     x, y, nx, ny, strength, bright = np.ascontiguousarray(points[:count].T)
     return x, y, nx, ny, strength, bright, index

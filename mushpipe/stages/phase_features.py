@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
 from mushpipe.stages.phase_edges import Gradient, Plane, Rows
-from mushpipe.stages.phase_refit import HIDDEN, Shape, Table, height_at, rise, step_up, turned
+from mushpipe.stages.phase_refit import HIDDEN, Shape, Table, height_at, rise, solve, step_up, turned
 
 Bytes = NDArray[np.uint8]
 
@@ -48,6 +48,8 @@ FIRST_DEPTH = len(IMAGE_FEATURES)
 GRID = 4  # the surface is sampled at up to (2 GRID + 1)^2 points
 SAMPLES = 16  # directions in which the disc is sampled
 LEAST_KNOWN = 0.35  # share of the disc with depth below which depth features are off
+_TURNS = 2 * np.pi * (np.arange(SAMPLES) + 0.5) / SAMPLES
+_COSINES, _SINES = np.cos(_TURNS), np.sin(_TURNS)
 _RINGS = np.array([0.15, 0.3, 0.45, 0.6, 0.75, 0.88, 0.97])
 
 
@@ -72,8 +74,7 @@ def disc_features(
     lines, width = image.shape
     area = set_area = inward = total = small = bright = small_area = 0.0
     for k in range(SAMPLES):
-        turn = 2 * math.pi * (k + 0.5) / SAMPLES
-        c, s = math.cos(turn), math.sin(turn)
+        c, s = _COSINES[k], _SINES[k]
         for t in rings:
             u, v = _pixel(shape[0] + t * shape[2] * c, shape[1] + t * shape[2] * s, width, lines)
             if u < 0:
@@ -98,8 +99,7 @@ def contrast_features(image: Plane, shape: Shape, row: Table) -> None:
     values = np.empty(SAMPLES)
     count, total = 0, 0.0
     for k in range(SAMPLES):
-        turn = 2 * math.pi * (k + 0.5) / SAMPLES
-        c, s = math.cos(turn), math.sin(turn)
+        c, s = _COSINES[k], _SINES[k]
         near, far = 0.85 * shape[2] - 1, 1.08 * shape[2] + 2
         a, b = _pixel(shape[0] + near * c, shape[1] + near * s, width, lines)
         u, v = _pixel(shape[0] + far * c, shape[1] + far * s, width, lines)
@@ -192,7 +192,7 @@ def surface_features(height: Plane, shape: Shape, pixel: float, row: Table) -> f
             return math.nan
         for p in range(6):
             a[p, p] += 1e-4
-        b[:] = np.linalg.solve(a, b)
+        solve(a, b)
         sigma = max(0.001, _misfit(height, shape, b)) if turn == 0 else sigma
     mean, spread = -(b[3] + b[5]), math.sqrt((b[3] - b[5]) ** 2 + b[4] ** 2)
     row[0] = b[0] / (abs(b[0]) + radius)

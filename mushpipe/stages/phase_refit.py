@@ -19,7 +19,7 @@ from mushpipe.stages.phase_edges import Edges, Plane, Rows, Singles
 Shape = NDArray[np.float64]
 Table = NDArray[np.float64]
 DIRECTIONS = 96
-ROUNDS = 4
+ROUNDS = 3
 REACH = 0.28  # of the radius: how far from the candidate edge points are looked for
 OVAL = 0.06  # of the radius: expected size of p and q
 TURNED = 0.7  # cosine between an edge's normal and the radius
@@ -124,16 +124,17 @@ def gather(edges: Edges, height: Plane, step: float, shape: Shape, coarse: int, 
 
 
 @jit
-def _solve5(a: Table, b: Table) -> None:
-    """Solve a x = b in place for a positive definite (5, 5) matrix; x replaces b."""
-    for i in range(5):
-        for j in range(i + 1, 5):
+def solve(a: Table, b: Table) -> None:
+    """Solve a x = b in place for a small positive definite matrix; x replaces b."""
+    size = len(b)
+    for i in range(size):
+        for j in range(i + 1, size):
             factor = a[j, i] / a[i, i]
-            for k in range(i, 5):
+            for k in range(i, size):
                 a[j, k] -= factor * a[i, k]
             b[j] -= factor * b[i]
-    for i in range(4, -1, -1):
-        for k in range(i + 1, 5):
+    for i in range(size - 1, -1, -1):
+        for k in range(i + 1, size):
             b[i] -= a[i, k] * b[k]
         b[i] /= a[i, i]
 
@@ -180,7 +181,7 @@ def fit_outline(edges: Edges, rows: Rows, count: int, shape: Shape, times: float
     start_x, start_y, start_r = shape[0], shape[1], shape[2]
     a, b = np.empty((5, 5)), np.empty(5)
     for turn in range(ROUNDS):
-        scale = max(1.0, (0.16, 0.11, 0.08, 0.06)[turn] * shape[2])
+        scale = max(1.0, (0.16, 0.09, 0.06)[turn] * shape[2])
         a[:] = 0
         b[:] = 0
         if times * _accumulate(edges, rows, count, shape, scale, a, b) < 4:
@@ -193,7 +194,7 @@ def fit_outline(edges: Edges, rows: Rows, count: int, shape: Shape, times: float
         for m in (3, 4):
             a[m, m] += prior
             b[m] -= prior * shape[m]
-        _solve5(a, b)
+        solve(a, b)
         for m in range(5):
             shape[m] += b[m]
         moved = math.hypot(shape[0] - start_x, shape[1] - start_y)
