@@ -13,7 +13,16 @@ from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
 from mushpipe.stages.phase_edges import Gradient, Plane, Rows
-from mushpipe.stages.phase_refit import HIDDEN, Shape, Table, height_at, rise, solve, step_up, turned
+from mushpipe.stages.phase_refit import (
+    HIDDEN,
+    Shape,
+    Table,
+    height_at,
+    rise,
+    solve,
+    step_up,
+    turned,
+)
 
 Bytes = NDArray[np.uint8]
 

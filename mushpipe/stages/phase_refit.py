@@ -28,7 +28,8 @@ PER_DIRECTION = 3
 # Shading inside an outline draws the phase to smaller radii; a second start finds the outer ring.
 STARTS = (1.0, 1.3)
 SAME = 0.04  # of the radius
-FIRM = 0.92  # share of the outline with edges, from which on no second start is made
+FAINT = 0.18  # share of the outline with edges below which a candidate is given up
+FIRM = 0.85  # share of the outline with edges, from which on no second start is made
 STEP_UP = 0.004  # m
 HIDDEN = -3  # in a table of hits: something nearer hides the outline there
 
@@ -214,6 +215,7 @@ def outline_hits(edges: Edges, shape: Shape, hits: Rows) -> tuple[int, int, floa
     x, y, r = shape[0], shape[1], shape[2]
     n, near = directions_of(r), tolerance(r)
     found, squares = 0, 0.0
+    hits[:] = -2
     cosine, sine = math.cos(2 * math.pi / n), math.sin(2 * math.pi / n)
     c, s = cosine, -sine
     for k in range(n):
@@ -277,6 +279,8 @@ def refit(
                 continue
             n, found, residual[kept] = outline_hits(edges, shape, hits[kept])
             firm[k] = found > FIRM * n
+            if found < FAINT * n:
+                continue
             kept += 1
     return shapes[:kept], hits[:kept], residual[:kept]
 
