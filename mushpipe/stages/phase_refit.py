@@ -28,6 +28,7 @@ PER_DIRECTION = 3
 # Shading inside an outline draws the phase to smaller radii; a second start finds the outer ring.
 STARTS = (1.0, 1.3)
 SAME = 0.04  # of the radius
+BUCKET = 8  # px; cells in which outlines are looked up
 FAINT = 0.18  # share of the outline with edges below which a candidate is given up
 FIRM = 0.85  # share of the outline with edges, from which on no second start is made
 STEP_UP = 0.004  # m
@@ -262,7 +263,9 @@ def refit(
     hits = np.full((n, DIRECTIONS), -2, np.int32)
     rows = np.empty(PER_DIRECTION * DIRECTIONS, np.int32)
     kept = 0
-    firm = np.zeros(len(candidates), np.bool_)
+    firm, following = np.zeros(len(candidates), np.bool_), np.empty(n, np.int32)
+    height_px, width_px = edges.pixels.shape
+    cells = np.full((height_px // BUCKET + 3, width_px // BUCKET + 3), -1, np.int32)
     for start in STARTS:
         for k in range(len(candidates)):
             if firm[k] or (start > 1 and candidates[k, 2] > 0.95 * largest):
@@ -275,25 +278,39 @@ def refit(
             if count < 5 or not fit_outline(edges, rows, count, shape, 2):
                 continue
             within = smallest * 0.9 <= shape[2] <= largest * 1.1
-            if not within or _known(shape, shapes[:kept]):
+            if not within or _known(shape, shapes, cells, following):
                 continue
             n, found, residual[kept] = outline_hits(edges, shape, hits[kept])
             firm[k] = found > FIRM * n
             if found < FAINT * n:
                 continue
+            row, column = _cell(shape, cells)
+            following[kept], cells[row, column] = cells[row, column], kept
             kept += 1
     return shapes[:kept], hits[:kept], residual[:kept]
 
 
 @jit
-def _known(shape: Shape, others: Table) -> bool:
-    """Whether another outline is the same but for a few per cent."""
+def _cell(shape: Shape, cells: Rows) -> tuple[int, int]:
+    """Return row and column of an outline's centre in a grid; places beyond it count as its rim."""
+    row = min(max(int(shape[1] / BUCKET), 1), cells.shape[0] - 2)
+    return row, min(max(int(shape[0] / BUCKET), 1), cells.shape[1] - 2)
+
+
+@jit
+def _known(shape: Shape, others: Table, cells: Rows, following: Rows) -> bool:
+    """Whether another outline is the same but for a few per cent.
+
+    `cells` holds the last outline entered in each cell of a grid, `following` the one before it.
+    """
     near = max(0.7, SAME * shape[2])
-    for other in others:
-        if (
-            abs(other[0] - shape[0]) < near
-            and abs(other[1] - shape[1]) < near
-            and abs(other[2] - shape[2]) < near
-        ):
-            return True
+    row, column = _cell(shape, cells)
+    for v in range(row - 1, row + 2):
+        for u in range(column - 1, column + 2):
+            k = cells[v, u]
+            while k >= 0:
+                away = max(abs(others[k, 0] - shape[0]), abs(others[k, 1] - shape[1]))
+                if max(away, abs(others[k, 2] - shape[2])) < near:
+                    return True
+                k = following[k]
     return False
