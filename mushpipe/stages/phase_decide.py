@@ -27,7 +27,7 @@ from mushpipe.stages.phase_refit import (
 
 MARGIN = 1.0  # px; so far within an accepted circle an outline counts as hidden by it
 SHADE = 3.0  # px; so far around an accepted circle, a lower one is shaded
-HOPELESS = 0.002  # probability from which on nothing that is accepted later can help
+HOPELESS = 2e-5  # probability from which on nothing that is accepted later can help
 TAKEN = 2.5  # px; edges so near an accepted outline are its own
 
 

@@ -29,8 +29,8 @@ PER_DIRECTION = 3
 STARTS = (1.0, 1.3)
 SAME = 0.04  # of the radius
 BUCKET = 8  # px; cells in which outlines are looked up
-FAINT = 0.18  # share of the outline with edges below which a candidate is given up
-FIRM = 0.85  # share of the outline with edges, from which on no second start is made
+FAINT = 0.15  # share of the outline with edges below which a candidate is given up
+FIRM = 0.9  # share of the outline with edges, from which on no second start is made
 STEP_UP = 0.004  # m
 HIDDEN = -3  # in a table of hits: something nearer hides the outline there
 
