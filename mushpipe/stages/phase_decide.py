@@ -20,10 +20,10 @@ from mushpipe.stages.phase_refit import (
     Table,
     fit_outline,
     gather,
-    step_up,
     tolerance,
     turned,
 )
+from mushpipe.stages.phase_steps import step_up
 
 MARGIN = 1.0  # px; so far within an accepted circle an outline counts as hidden by it
 SHADE = 3.0  # px; so far around an accepted circle, a lower one is shaded

@@ -13,16 +13,8 @@ from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
 from mushpipe.stages.phase_edges import Gradient, Plane, Rows
-from mushpipe.stages.phase_refit import (
-    HIDDEN,
-    Shape,
-    Table,
-    height_at,
-    rise,
-    solve,
-    step_up,
-    turned,
-)
+from mushpipe.stages.phase_refit import HIDDEN, Shape, Table, solve, turned
+from mushpipe.stages.phase_steps import height_at, rise, step_up
 
 Bytes = NDArray[np.uint8]
 

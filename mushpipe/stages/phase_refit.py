@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
 from mushpipe.stages.phase_edges import Edges, Plane, Rows, Singles
+from mushpipe.stages.phase_steps import rise, step_up
 
 Shape = NDArray[np.float64]
 Table = NDArray[np.float64]
@@ -31,7 +32,6 @@ SAME = 0.04  # of the radius
 BUCKET = 8  # px; cells in which outlines are looked up
 FAINT = 0.15  # share of the outline with edges below which a candidate is given up
 FIRM = 0.9  # share of the outline with edges, from which on no second start is made
-STEP_UP = 0.004  # m
 HIDDEN = -3  # in a table of hits: something nearer hides the outline there
 
 
@@ -51,40 +51,6 @@ def turned(c: float, s: float, cosine: float, sine: float) -> tuple[float, float
 def tolerance(radius: float) -> float:
     """Return how far (px) from the outline an edge point still supports it."""
     return max(1.5, 0.07 * radius)
-
-
-@jit
-def step_up(radius: float) -> float:
-    """Return the difference of heights (m) that counts as a step at a cap of a radius (m)."""
-    return max(STEP_UP, 0.15 * radius)
-
-
-@jit
-def height_at(height: Plane, x: float, y: float) -> float:
-    """Return the height (m) at an image point; -1 where it is unknown."""
-    u, v = int((x + 0.5) * 0.5), int((y + 0.5) * 0.5)
-    if x < 0 or y < 0 or u >= height.shape[1] or v >= height.shape[0]:
-        return -1.0
-    return float(height[v, u])
-
-
-@jit
-def rise(height: Plane, x: float, y: float, c: float, s: float, radius: float) -> float:
-    """Return by how much (m) the highest point just outside an outline lies over its inside.
-
-    Negative where everything outside is lower; 0 where nothing is known.
-    """
-    inside = max(
-        height_at(height, x + 0.75 * radius * c, y + 0.75 * radius * s),
-        height_at(height, x + 0.85 * radius * c, y + 0.85 * radius * s),
-    )
-    outside = -1.0
-    for k in range(3):
-        t = radius * (1.12 + 0.08 * k) + 1.5
-        outside = max(outside, height_at(height, x + t * c, y + t * s))
-    if inside == -1 or outside == -1:
-        return 0.0
-    return outside - inside
 
 
 @jit
