@@ -22,6 +22,7 @@ from mushpipe.stages.chan_vese import ChanVese
 from mushpipe.stages.flatten import Flatten
 from mushpipe.stages.opening import Opening
 from mushpipe.stages.otsu import Otsu
+from mushpipe.stages.phase_decide import LIMIT
 from mushpipe.stages.phase_features import IMAGE_FEATURES, NAMES
 from mushpipe.stages.phase_hough import PhaseHough, equal_area_radius
 from mushpipe.stages.verifier import COLUMNS
@@ -45,7 +46,7 @@ RIGHT, WRONG = (Ignore.AT_BORDER, Ignore.TOO_LARGE), (Ignore.CUT_STUMP,)
 HEAD = """\
 # The verifier of the stage `phase-hough`: one logistic regression per kind of input, made by
 # `make verifier` from simulated scenes alone. A feature x (docs/detection.md says what each is)
-# adds  weight z + square z^2  to the logit, with z = (x - mean) / scale, clipped to -4..4.
+# adds  weight z + square z^2  to the logit, with z = (x - mean) / scale, clipped to -2.5..2.5.
 """
 
 
@@ -112,7 +113,7 @@ def fit(features: Floats, right: Floats, names: tuple[str, ...], ridge: float) -
     """
     x = features[:, [NAMES.index(name) for name in names]]
     mean, scale = x.mean(axis=0), np.maximum(x.std(axis=0), 1e-3)
-    z = np.clip((x - mean) / scale, -4, 4)
+    z = np.clip((x - mean) / scale, -LIMIT, LIMIT)
     basis = np.column_stack([np.ones(len(z)), z, z * z])
 
     def loss(w: Floats) -> tuple[float, Floats]:
@@ -171,7 +172,7 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, default=Path("out/scenes"), help="rendered frames")
     parser.add_argument("--out", type=Path, default=Path("mushpipe/stages/verifier.yaml"))
     parser.add_argument("--rounds", type=int, default=4)
-    parser.add_argument("--ridge", type=float, default=3e-4)
+    parser.add_argument("--ridge", type=float, default=1e-3)
     arguments = parser.parse_args()
     train(arguments.cache, arguments.out, arguments.rounds, arguments.ridge)
 

@@ -28,6 +28,7 @@ from mushpipe.stages.phase_steps import step_up
 MARGIN = 1.0  # px; so far within an accepted circle an outline counts as hidden by it
 SHADE = 3.0  # px; so far around an accepted circle, a lower one is shaded
 HOPELESS = 2e-5  # probability from which on nothing that is accepted later can help
+LIMIT = 2.5  # of a standardised feature: beyond the scenes of the training it says no more
 TAKEN = 2.5  # px; edges so near an accepted outline are its own
 
 
@@ -119,7 +120,7 @@ def probability(row: Table, weights: Table) -> float:
     logit = weights[-1, 2]
     for k in range(len(row)):
         z = (row[k] - weights[k, 0]) / weights[k, 1]
-        z = min(4.0, max(-4.0, z))
+        z = min(LIMIT, max(-LIMIT, z))
         logit += weights[k, 2] * z + weights[k, 3] * z * z
     return 1 / (1 + math.exp(-logit))
 
