@@ -50,6 +50,11 @@ unit: $(STAMP)-dev
 test-slow: $(STAMP)-dev system-libraries
 	$(BIN)/pytest -m slow
 
+# Weights of the detector's verifier, from simulated scenes alone; rendering takes minutes.
+.PHONY: verifier
+verifier: $(STAMP) system-libraries
+	$(BIN)/python -m training.verifier
+
 recordings: $(STAMP) system-libraries
 	$(BIN)/python -m mushpipe.sim.recordings
 

@@ -14,6 +14,7 @@ def mushpipe_register(registry: Registry) -> None:
     registry.stage("height", "mushpipe.stages.height:Height")
     registry.stage("flatten", "mushpipe.stages.flatten:Flatten")
     registry.stage("opening", "mushpipe.stages.opening:Opening")
+    registry.stage("phase-hough", "mushpipe.stages.phase_hough:PhaseHough")
     registry.stage("hough", "mushpipe.stages.hough:Hough")
     registry.stage("nearest-depth", "mushpipe.stages.nearest_depth:NearestDepth")
     registry.stage("depth-correct", "mushpipe.stages.depth_correct:DepthCorrect")

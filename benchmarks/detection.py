@@ -1,0 +1,113 @@
+"""Time and F of segmentation plus detection beside the naive chain.
+
+Run it with `python benchmarks/detection.py`. The naive chain is scikit-image's Chan-Vese (500
+iterations) from Otsu's contour, the same opening, and OpenCV's HoughCircles. Both run on the same
+simulated frames of 150 mushrooms in clusters, on one thread; a CPU time is that thread's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numba
+import numpy as np
+import skimage
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from mushpipe import Circles, RgbdFrame
+from mushpipe.stages.chan_vese import ChanVese
+from mushpipe.stages.flatten import Flatten
+from mushpipe.stages.hough import Hough
+from mushpipe.stages.opening import Opening
+from mushpipe.stages.phase_hough import PhaseHough
+from training.matching import Score, counted
+from training.scenes import JUDGING_SEED, render
+from training.verifier import RADII
+
+Chain = Callable[[RgbdFrame], Circles]
+
+
+def chain(segment: ChanVese, detect: PhaseHough | Hough, flat: Flatten | None) -> Chain:
+    """Return segmentation, opening and detection as one function."""
+    opening = Opening()
+    for stage in (segment, detect, flat):
+        if stage is not None:
+            stage.open()
+
+    def run(frame: RgbdFrame) -> Circles:
+        frame = flat.process(frame) if flat else frame
+        return detect.process(frame, opening.process(segment.process(frame)))
+
+    return run
+
+
+def fresh(frame: RgbdFrame) -> RgbdFrame:
+    """Return the frame without what it has cached: gray, depth in metres."""
+    return RgbdFrame(frame.header, frame.color, frame.depth, frame.depth_scale, frame.camera)
+
+
+def measured(run: Chain, cases: list, repeats: int) -> tuple[float, float, Score]:  # type: ignore[type-arg]
+    """Return median CPU and wall time, ms per frame, and the score."""
+    score, cpu, wall = Score(), [], []
+    for case in cases:
+        for turn in range(repeats):
+            frame = fresh(case.frame)
+            began, started = time.perf_counter(), time.thread_time()
+            circles = run(frame)
+            cpu.append((time.thread_time() - started) * 1e3)
+            wall.append((time.perf_counter() - began) * 1e3)
+            if turn == 0:
+                score.add(circles, case.truth, counted(case.truth, *RADII))
+    return statistics.median(cpu), statistics.median(wall), score
+
+
+def main() -> None:
+    """Run both chains."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cache", type=Path, default=Path("out/scenes"), help="rendered frames")
+    parser.add_argument("--frames", type=int, default=2)
+    parser.add_argument("--repeats", type=int, default=20, help="runs per frame of the fast chains")
+    parser.add_argument("--iterations", type=int, default=500, help="of the naive Chan-Vese")
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+    seeds = [JUDGING_SEED + 40 + k for k in range(arguments.frames)]
+    cases = [render("dense", "b", seed, arguments.cache) for seed in seeds]
+    naive = ChanVese(solver="pde", iterations=arguments.iterations, tolerance=1e-12)
+    chains = {
+        "naive": (chain(naive, Hough(radius_px=RADII), None), 1),
+        "naive, gradient": (chain(naive, Hough(radius_px=RADII, method="gradient"), None), 1),
+        "fast with depth": (
+            chain(ChanVese(), PhaseHough(radius_px=RADII), None), arguments.repeats,
+        ),
+        "fast, no depth": (
+            chain(ChanVese(), PhaseHough(radius_px=RADII, use_depth=False), None),
+            arguments.repeats,
+        ),
+        "with flatten": (
+            chain(ChanVese(), PhaseHough(radius_px=RADII), Flatten()), arguments.repeats,
+        ),
+    }  # fmt: skip
+    print(f"python {platform.python_version()}, numpy {np.__version__}, numba {numba.__version__},")
+    print(f"opencv {cv2.__version__}, scikit-image {skimage.__version__}; {platform.processor()}")
+    print(f"scene dense, family b, seeds {seeds}, 640x480")
+    reference = 0.0
+    for name, (run, repeats) in chains.items():
+        cpu, wall, score = measured(run, cases, repeats)
+        reference = reference or cpu
+        print(
+            f"{name:16} CPU {cpu:9.2f} ms  wall {wall:9.2f} ms  F {score.f:.4f} "
+            f"(recall {score.recall:.3f}, precision {score.precision:.3f})  "
+            f"{reference / cpu:7.0f} x faster"
+        )
+
+
+if __name__ == "__main__":
+    main()

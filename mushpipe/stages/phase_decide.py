@@ -1,0 +1,236 @@
+"""Accepting candidates one by one: each explains its edges away for those that come after it.
+
+The candidate with the largest probability is accepted, and its edges are used up. Its neighbours
+are then looked at again: another circle on the same cap has lost its support, while one below it
+need no longer show the outline that it hides. This is the non-maximum suppression of the detector.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mushpipe.core.jit import jit
+from mushpipe.stages.phase_edges import Edges, Plane, Rows
+from mushpipe.stages.phase_refit import (
+    HIDDEN,
+    Shape,
+    Table,
+    fit_outline,
+    gather,
+    tolerance,
+    turned,
+)
+from mushpipe.stages.phase_steps import step_up
+
+MARGIN = 1.0  # px; so far within an accepted circle an outline counts as hidden by it
+SHADE = 3.0  # px; so far around an accepted circle, a lower one is shaded
+HOPELESS = 2e-5  # probability from which on nothing that is accepted later can help
+LIMIT = 2.5  # of a standardised feature: beyond the scenes of the training it says no more
+TAKEN = 2.5  # px; edges so near an accepted outline are its own
+
+
+@jit
+def lens(distance: float, first: float, second: float) -> float:
+    """Return the area that two circles share."""
+    if distance >= first + second:
+        return 0.0
+    small = min(first, second)
+    if distance <= abs(first - second):
+        return math.pi * small * small
+    a = (distance**2 + first**2 - second**2) / (2 * distance * first)
+    b = (distance**2 + second**2 - first**2) / (2 * distance * second)
+    k = (first + second - distance) * (distance + first - second)
+    k *= (distance - first + second) * (distance + first + second)
+    triangle = 0.5 * math.sqrt(max(k, 0.0))
+    sectors = first**2 * math.acos(min(1, max(-1, a))) + second**2 * math.acos(min(1, max(-1, b)))
+    return sectors - triangle
+
+
+@jit
+def overlap_features(shape: Shape, accepted: Table, row: Table) -> None:
+    """Write overlap, spans and doubled into row[4], row[5], row[6]."""
+    row[4] = row[5] = row[6] = 0
+    own = math.pi * shape[2] ** 2
+    for other in accepted:
+        d = math.hypot(other[0] - shape[0], other[1] - shape[1])
+        if d >= other[2] + shape[2]:
+            continue
+        shared, area = lens(d, shape[2], other[2]), math.pi * other[2] ** 2
+        row[4] = max(row[4], shared / own)
+        row[5] = max(row[5], shared / area)
+        row[6] = max(row[6], shared / (own + area - shared))
+
+
+@jit
+def _covered(x: float, y: float, accepted: Table, margin: float) -> bool:
+    """Whether a point lies within a circle by more than a margin (px)."""
+    for other in accepted:
+        if (x - other[0]) ** 2 + (y - other[1]) ** 2 < max(0.0, other[2] - margin) ** 2:
+            return True
+    return False
+
+
+@jit
+def outline_features(
+    edges: Edges, shape: Shape, hits: Rows, owner: Rows, accepted: Table, row: Table
+) -> None:
+    """Write free, support, trust and hits into row[0..3].
+
+    A direction is hidden where depth says so (`HIDDEN`), or where it lies within an accepted circle
+    and has no edge of its own left.
+    """
+    height, width = edges.pixels.shape
+    n, inside, free, found, weight = 0, 0, 0, 0, 0.0
+    while n < len(hits) and hits[n] != -2:
+        n += 1
+    cosine, sine = math.cos(2 * math.pi / max(n, 1)), math.sin(2 * math.pi / max(n, 1))
+    c, s = cosine, -sine
+    for k in range(n):
+        c, s = turned(c, s, cosine, sine)
+        x, y = shape[0] + shape[2] * c, shape[1] + shape[2] * s
+        if x < 0 or y < 0 or x > width - 1 or y > height - 1:
+            continue
+        inside += 1
+        if hits[k] == HIDDEN:
+            continue
+        if hits[k] >= 0 and owner[hits[k]] < 0:
+            free += 1
+            found += 1
+            weight += edges.weight[hits[k]]
+        elif not _covered(x, y, accepted, MARGIN):
+            free += 1
+    row[0] = free / max(inside, 1)
+    row[1] = found / max(free, 1)
+    row[2] = weight / max(free, 1)
+    row[3] = math.log(1 + found)
+
+
+@jit
+def probability(row: Table, weights: Table) -> float:
+    """Return the logistic probability of a row of features.
+
+    Args:
+        row: (F,) features.
+        weights: (F + 1, 4): mean, scale, weight, weight of the square; the last row's weight is
+            the intercept.
+    """
+    logit = weights[-1, 2]
+    for k in range(len(row)):
+        z = (row[k] - weights[k, 0]) / weights[k, 1]
+        z = min(LIMIT, max(-LIMIT, z))
+        logit += weights[k, 2] * z + weights[k, 3] * z * z
+    return 1 / (1 + math.exp(-logit))
+
+
+@jit
+def _use_up(edges: Edges, shape: Shape, number: int, owner: Rows, rows: Rows) -> None:
+    nothing = np.zeros((0, 0), np.float32)
+    count = gather(edges, nothing, 0.0, shape, 1, rows)
+    near = max(TAKEN, 1.3 * tolerance(shape[2]))
+    for k in range(count):
+        dx, dy = edges.x[rows[k]] - shape[0], edges.y[rows[k]] - shape[1]
+        d = max(1e-6, math.hypot(dx, dy))
+        c, s = dx / d, dy / d
+        e = d - (shape[2] + shape[3] * (c * c - s * s) + shape[4] * 2 * s * c)
+        if abs(e) < near and owner[rows[k]] < 0:
+            owner[rows[k]] = number
+
+
+@jit
+def decide(
+    edges: Edges, shapes: Table, hits: Rows, table: Table, depth: NDArray[np.bool_],
+    image_weights: Table, depth_weights: Table, least: float,
+) -> tuple[Rows, Table, Rows]:  # fmt: skip
+    """Accept candidates in the order of their probability.
+
+    Args:
+        edges: Edge points.
+        shapes: (N, 5) outlines.
+        hits: (N, D) rows of the edges that support them.
+        table: (N, F) features; those that depend on others are written, as they stood when the
+            candidate was accepted, or at the end.
+        depth: (N,) whether a candidate's features of depth are known.
+        image_weights: (F + 1, 4) weights where they are not.
+        depth_weights: (F + 1, 4) weights where they are.
+        least: Smallest probability that is accepted.
+
+    Returns:
+        Rows of the accepted in their order, the probability of every candidate, and of every edge
+        point the number of the accepted circle that it belongs to, -1 for none.
+    """
+    n = len(shapes)
+    owner = np.full(len(edges.x), -1, np.int32)
+    chance, waiting = np.ones(n), np.ones(n, np.bool_)
+    accepted, order = np.empty((n, 5)), np.empty(n, np.int32)
+    rows = np.empty(4096, np.int32)
+    count = 0
+    while True:
+        best, top = -1, least
+        for k in range(n):
+            # Not only what it used up: what it hides, too, changes the odds of its neighbours.
+            alive = waiting[k] and chance[k] > HOPELESS
+            if alive and (count == 0 or _meet(shapes[k], accepted[count - 1])):
+                near = _neighbours(shapes[k], accepted[:count])
+                outline_features(edges, shapes[k], hits[k], owner, near, table[k])
+                overlap_features(shapes[k], near, table[k])
+                chance[k] = probability(table[k], depth_weights if depth[k] else image_weights)
+            if waiting[k] and chance[k] >= top:
+                best, top = k, chance[k]
+        if best < 0:
+            break
+        waiting[best] = False
+        accepted[count], order[count] = shapes[best], best
+        _use_up(edges, shapes[best], count, owner, rows)
+        count += 1
+    return order[:count], chance, owner
+
+
+@jit
+def _meet(one: Shape, other: Shape) -> bool:
+    """Whether two outlines are so near that accepting one may change what is known of the other."""
+    reach = one[2] + other[2] + 4
+    return bool((one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2 < reach * reach)
+
+
+@jit
+def _neighbours(shape: Shape, accepted: Table) -> Table:
+    """Return the accepted outlines whose circle meets the circle of a shape."""
+    found = np.empty_like(accepted)
+    count = 0
+    for other in accepted:
+        reach = other[2] + shape[2]
+        if (other[0] - shape[0]) ** 2 + (other[1] - shape[1]) ** 2 < reach * reach:
+            found[count] = other
+            count += 1
+    return found[:count]
+
+
+@jit
+def polish(edges: Edges, height: Plane, pixel: float, outlines: Table, owner: Rows) -> None:
+    """Refit accepted outlines (K, 5), in their order and in place, to what is theirs alone.
+
+    Edges of others do not count, nor those within or just outside a circle that was accepted
+    before: where a cap dips under another one, its steepest shading is not its outline.
+    """
+    rows, own = np.empty(4096, np.int32), np.empty(4096, np.int32)
+    shape = np.empty(5)
+    for k in range(len(outlines)):
+        shape[:] = outlines[k]
+        near = _neighbours(shape, outlines[:k])
+        count = gather(edges, height, step_up(shape[2] * pixel), shape, 1, rows)
+        kept = 0
+        for m in range(count):
+            row = rows[m]
+            if owner[row] >= 0 and owner[row] != k:
+                continue
+            if not _covered(edges.x[row], edges.y[row], near, -SHADE):
+                own[kept] = row
+                kept += 1
+        moved = fit_outline(edges, own, kept, shape, 1) if kept >= 12 else False
+        limit = max(1.5, 0.15 * outlines[k, 2])
+        away = math.hypot(shape[0] - outlines[k, 0], shape[1] - outlines[k, 1])
+        if moved and abs(shape[2] - outlines[k, 2]) < limit and away < limit:
+            outlines[k] = shape

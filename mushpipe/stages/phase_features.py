@@ -1,0 +1,273 @@
+"""What speaks for and against a candidate: named features, each with one definition.
+
+Features of the image, then features that need depth. `free`, `support`, `trust`, `hits`, `overlap`,
+`spans` and `doubled` depend on what has been accepted before and stand in `phase_decide`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mushpipe.core.jit import jit
+from mushpipe.stages.phase_edges import Gradient, Plane, Rows
+from mushpipe.stages.phase_refit import HIDDEN, Shape, Table, solve, turned
+from mushpipe.stages.phase_steps import height_at, rise, step_up
+
+Bytes = NDArray[np.uint8]
+
+IMAGE_FEATURES = {
+    "free": "share of the outline, within the image, that nothing nearer hides",
+    "support": "share of the free outline with an edge that no accepted circle has used",
+    "trust": "mean weight of the edges of the free outline, 0 where there is none",
+    "hits": "logarithm of 1 + the number of those edges",
+    "overlap": "largest share of the disc that one accepted circle covers",
+    "spans": "largest share of an accepted circle that the disc covers",
+    "doubled": "largest IoU with an accepted circle",
+    "residual": "root mean square distance of the edges from the outline, over the radius",
+    "oval": "departure of the outline from a circle, over the radius",
+    "cover": "share of the disc that the mask covers",
+    "coherence": "sum of the inward part of the gradient over the disc, over the sum of its size",
+    "contrast": "brightness just inside minus just outside, over their sum, mean over the outline",
+    "darkest": "the same where it is least, over a quarter of the outline",
+    "texture": "mean gradient within 0.7 radii times the radius, over the mean brightness",
+}
+DEPTH_FEATURES = {
+    "height": "height h of the middle over the bed, as h / (|h| + R)",
+    "bend_small": "smaller principal curvature of the surface, times R; a sphere has 1, a stem 0",
+    "bend_large": "larger principal curvature, times R",
+    "roughness": "root mean square residual of a quadric fitted to the surface, over R",
+    "drop": "share of the known outline outside which it is lower by a step",
+    "rise": "share of the known outline outside which it is higher by a step",
+    "gap": "share of the disc without depth",
+}
+NAMES = (*IMAGE_FEATURES, *DEPTH_FEATURES)
+FIRST_STATIC = list(NAMES).index("residual")
+FIRST_DEPTH = len(IMAGE_FEATURES)
+GRID = 4  # the surface is sampled at up to (2 GRID + 1)^2 points
+SAMPLES = 16  # directions in which the disc is sampled
+LEAST_KNOWN = 0.35  # share of the disc with depth below which depth features are off
+_TURNS = 2 * np.pi * (np.arange(SAMPLES) + 0.5) / SAMPLES
+_COSINES, _SINES = np.cos(_TURNS), np.sin(_TURNS)
+_RINGS = np.array([0.15, 0.3, 0.45, 0.6, 0.75, 0.88, 0.97])
+
+
+@jit
+def _pixel(x: float, y: float, width: int, height: int) -> tuple[int, int]:
+    """Nearest pixel; x = -1 beyond the image."""
+    u, v = math.floor(x + 0.5), math.floor(y + 0.5)
+    if u < 0 or v < 0 or u >= width or v >= height:
+        return -1, -1
+    return u, v
+
+
+@jit
+def disc_features(
+    image: Plane, gx: Plane, gy: Plane, size: Plane, mask: Bytes, shape: Shape, rings: Table,
+    row: Table,
+) -> None:  # fmt: skip
+    """Write cover, coherence and texture of a disc, sampled on a polar grid, into row[0], [1], [4].
+
+    Samples count by the area they stand for.
+    """
+    lines, width = image.shape
+    area = set_area = inward = total = small = bright = small_area = 0.0
+    for k in range(SAMPLES):
+        c, s = _COSINES[k], _SINES[k]
+        for t in rings:
+            u, v = _pixel(shape[0] + t * shape[2] * c, shape[1] + t * shape[2] * s, width, lines)
+            if u < 0:
+                continue
+            area += t
+            set_area += t * mask[v, u]
+            inward -= t * (gx[v, u] * c + gy[v, u] * s)
+            total += t * size[v, u]
+            if t < 0.7:
+                small += t * size[v, u]
+                bright += t * image[v, u]
+                small_area += t
+    row[0] = set_area / max(area, 1e-9)
+    row[1] = inward / max(total, 1e-9)
+    row[4] = min(4.0, small * shape[2] / max(bright, 1e-9 + 4 * small_area))
+
+
+@jit
+def contrast_features(image: Plane, shape: Shape, row: Table) -> None:
+    """Write contrast and darkest into row[2], row[3]; directions beyond the image do not count."""
+    lines, width = image.shape
+    values = np.empty(SAMPLES)
+    count, total = 0, 0.0
+    for k in range(SAMPLES):
+        c, s = _COSINES[k], _SINES[k]
+        near, far = 0.85 * shape[2] - 1, 1.08 * shape[2] + 2
+        a, b = _pixel(shape[0] + near * c, shape[1] + near * s, width, lines)
+        u, v = _pixel(shape[0] + far * c, shape[1] + far * s, width, lines)
+        if a < 0 or u < 0:
+            continue
+        inside, outside = image[b, a], image[v, u]
+        values[count] = (inside - outside) / (inside + outside + 8)
+        total += values[count]
+        count += 1
+    if count == 0:
+        row[2] = row[3] = 0
+        return
+    row[2] = total / count
+    ordered = np.sort(values[:count])
+    quarter = max(1, count // 4)
+    row[3] = ordered[:quarter].mean()
+
+
+@jit
+def _quadric(height: Plane, shape: Shape, sigma: float, a: Table, b: Table) -> tuple[int, int]:
+    """Gather the normal equations of z = b0 + b1 u + b2 v + b3 u^2 + b4 u v + b5 v^2.
+
+    Coordinates u, v are in radii. On entry `b` is the previous solution, from which far points
+    (beyond 3 sigma) are left out unless sigma is 0; on return it is the right side. Returns the
+    numbers of points with and without depth.
+    """
+    n, known, unknown = GRID, 0, 0
+    before = b.copy()
+    a[:] = 0
+    b[:] = 0
+    basis = np.empty(6)
+    for i in range(-n, n + 1):
+        for j in range(-n, n + 1):
+            u, v = 0.75 * i / n, 0.75 * j / n
+            if u * u + v * v > 0.5625:
+                continue
+            z = height_at(height, shape[0] + u * shape[2], shape[1] + v * shape[2])
+            if z == -1:
+                unknown += 1
+                continue
+            known += 1
+            basis[0], basis[1], basis[2] = 1, u, v
+            basis[3], basis[4], basis[5] = u * u, u * v, v * v
+            if sigma > 0 and abs(basis @ before - z) > 3 * sigma:
+                continue
+            for p in range(6):
+                b[p] += basis[p] * z
+                for q in range(6):
+                    a[p, q] += basis[p] * basis[q]
+    return known, unknown
+
+
+@jit
+def _misfit(height: Plane, shape: Shape, b: Table) -> float:
+    """Return the root mean square residual of a quadric, m; each clipped to 0.3 of the radius."""
+    n, count, total = GRID, 0, 0.0
+    for i in range(-n, n + 1):
+        for j in range(-n, n + 1):
+            u, v = 0.75 * i / n, 0.75 * j / n
+            if u * u + v * v > 0.5625:
+                continue
+            z = height_at(height, shape[0] + u * shape[2], shape[1] + v * shape[2])
+            if z != -1:
+                e = b[0] + b[1] * u + b[2] * v + b[3] * u * u + b[4] * u * v + b[5] * v * v - z
+                total += min(abs(e), 0.02) ** 2
+                count += 1
+    return math.sqrt(total / max(count, 1))
+
+
+@jit
+def surface_features(height: Plane, shape: Shape, pixel: float, row: Table) -> float:
+    """Write height, bend_small, bend_large, roughness and gap into row[0..3] and row[6].
+
+    Args:
+        height: (h, w) m at half resolution, -1 where unknown.
+        shape: x, y, r, p, q.
+        pixel: Size of a pixel on the bed, m.
+        row: Receives the features.
+
+    Returns:
+        The height of the middle, m; NaN where too little is known.
+    """
+    a, b = np.zeros((6, 6)), np.zeros(6)
+    radius = shape[2] * pixel
+    sigma = 0.0
+    for turn in range(2):
+        known, unknown = _quadric(height, shape, sigma, a, b)
+        row[6] = unknown / max(known + unknown, 1)
+        if row[6] > 1 - LEAST_KNOWN or known < 8:
+            return math.nan
+        for p in range(6):
+            a[p, p] += 1e-4
+        solve(a, b)
+        sigma = max(0.001, _misfit(height, shape, b)) if turn == 0 else sigma
+    mean, spread = -(b[3] + b[5]), math.sqrt((b[3] - b[5]) ** 2 + b[4] ** 2)
+    row[0] = b[0] / (abs(b[0]) + radius)
+    row[1] = min(3.0, max(-2.0, (mean - spread) / radius))
+    row[2] = min(4.0, max(-2.0, (mean + spread) / radius))
+    row[3] = min(1.0, _misfit(height, shape, b) / radius)
+    return float(b[0])
+
+
+@jit
+def edge_features(height: Plane, shape: Shape, pixel: float, hits: Rows, row: Table) -> None:
+    """Write drop and rise into row[4], row[5]; mark directions of `hits` with a rise as hidden."""
+    step = step_up(shape[2] * pixel)
+    n, known, lower, higher = 0, 0, 0, 0
+    while n < len(hits) and hits[n] != -2:
+        n += 1
+    cosine, sine = math.cos(2 * math.pi / max(n, 1)), math.sin(2 * math.pi / max(n, 1))
+    c, s = cosine, -sine
+    for k in range(n):
+        c, s = turned(c, s, cosine, sine)
+        up = rise(height, shape[0], shape[1], c, s, shape[2])
+        if up == 0:
+            continue
+        known += 1
+        if up < -step:
+            lower += 1
+        elif up > step:
+            higher += 1
+            hits[k] = HIDDEN
+    row[4] = lower / max(known, 1)
+    row[5] = higher / max(known, 1)
+
+
+@jit
+def _static(
+    image: Plane, gx: Plane, gy: Plane, size: Plane, mask: Bytes, height: Plane, pixel: float,
+    shapes: Table, hits: Rows, residual: Plane, rings: Table, table: Table, middle: Table,
+    places: tuple[int, int],
+) -> None:  # fmt: skip
+    first, depth = places
+    for k in range(len(shapes)):
+        shape, row = shapes[k], table[k]
+        row[first] = residual[k] / shape[2]
+        row[first + 1] = math.hypot(shape[3], shape[4]) / shape[2]
+        disc_features(image, gx, gy, size, mask, shape, rings, row[first + 2 :])
+        contrast_features(image, shape, row[first + 2 :])
+        middle[k] = math.nan
+        if len(height):
+            middle[k] = surface_features(height, shape, pixel, row[depth:])
+            if middle[k] == middle[k]:
+                edge_features(height, shape, pixel, hits[k], row[depth:])
+
+
+def static_features(
+    image: Plane, grad: Gradient, mask: Bytes, height: Plane, pixel: float,
+    shapes: Table, hits: Rows, residual: Plane,
+) -> tuple[Table, Table]:  # fmt: skip
+    """Return all features that do not depend on other candidates, (N, F), and heights (N,) m.
+
+    The others are 0. A height is NaN where depth is missing, and the features of depth then 0.
+
+    Args:
+        image: (H, W) gray levels.
+        grad: Its gradient.
+        mask: (H, W) 0 or 1.
+        height: (h, w) m at half resolution, -1 where unknown; empty without depth.
+        pixel: Size of a pixel on the bed, m.
+        shapes: (N, 5) outlines.
+        hits: (N, D) rows of the edges that support them; hidden directions are marked in it.
+        residual: (N,) px.
+    """
+    table, middle = np.zeros((len(shapes), len(NAMES))), np.full(len(shapes), np.nan)
+    places = (FIRST_STATIC, FIRST_DEPTH)
+    _static(
+        image, *grad, mask, height, pixel, shapes, hits, residual, _RINGS, table, middle, places
+    )
+    return table, middle

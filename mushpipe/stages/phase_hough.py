@@ -1,0 +1,217 @@
+"""Stage `phase-hough`: every cap as a sub-pixel circle, by the phase-coded Hough transform."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal, Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, PrivateAttr, model_validator
+
+from mushpipe import Circles, Mask, RgbdFrame, Stage
+from mushpipe.core.stage import GraphPath
+from mushpipe.stages.phase_decide import decide, polish
+from mushpipe.stages.phase_depth import NO_RELIEF, Relief, relief_of
+from mushpipe.stages.phase_edges import (
+    Edges,
+    Gradient,
+    Plane,
+    Rows,
+    edges_of,
+    gradient_of,
+    otsu_of,
+)
+from mushpipe.stages.phase_features import static_features
+from mushpipe.stages.phase_fuse import fused
+from mushpipe.stages.phase_refit import Table, refit
+from mushpipe.stages.phase_votes import CELL, peaks, rings_between, summed, vote
+from mushpipe.stages.verifier import Verifier, load_verifier
+
+Positive = Annotated[float, Field(gt=0)]
+Bytes = NDArray[np.uint8]
+_FLOOR = 4.0  # gray levels per px; Otsu's threshold of an image without edges is noise
+_TOP = 64.0  # gray levels per px; larger gradients count as this in Otsu's threshold
+_STANDING = 0.004  # m; what is higher than this over the bed is looked at, in the mask or not
+_REACH = 2  # cells around a peak within which it must be the highest
+_SMALLEST = 12  # px; images smaller than this in either direction hold no circle
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What was found before anything is decided.
+
+    Attributes:
+        edges: Edge points.
+        shapes: (N, 5) outlines x, y, r, p, q, px.
+        hits: (N, D) rows of the edges that support each.
+        table: (N, F) features.
+        middle: (N,) m height of the middle over the bed, NaN without depth.
+        height: (h, w) m over the bed at half resolution, empty without depth.
+        pixel: Size of a pixel on the bed, m.
+    """
+
+    edges: Edges
+    shapes: Table
+    hits: Rows
+    table: Table
+    middle: Table
+    height: Plane
+    pixel: float
+
+
+class PhaseHough(Stage):
+    """Detects caps with the phase-coded circular Hough transform of Atherton & Kerbyson (1999).
+
+    Edge points of the gray image, and of the depth image where there is one, vote for centres; each
+    peak is refitted to its edges, and a small logistic verifier over named features decides, cap by
+    cap, in the order of its probability. The score is that probability. Circles have the area of
+    the outline, so a tilted cap's is between its long and its short axis.
+    """
+
+    input: Literal["image", "mask"] = Field(
+        "image", description="where edges are taken from; `mask` is the paper's variant, no depth"
+    )
+    radius_px: tuple[Positive, Positive] | None = Field(
+        (8, 38),
+        description="smallest and largest radius, px; null takes them from diameter_mm and depth",
+    )
+    diameter_mm: tuple[Positive, Positive] = Field(
+        (8, 120), description="smallest and largest diameter, mm, where there is depth"
+    )
+    min_score: float = Field(0.5, ge=0, le=1, description="smallest score that is kept")
+    edge: float = Field(
+        0.25, gt=0, le=2, description="least gradient, in units of Otsu's threshold of gradients"
+    )
+    evidence: float = Field(
+        0.07, ge=0.01, le=1, description="least share of an outline that votes, for a candidate"
+    )
+    use_depth: bool = Field(True, description="false ignores depth")
+    verifier: GraphPath | None = Field(None, description="another verifier than the package's")
+
+    _verifier: Verifier | None = PrivateAttr(None)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        for name in ("radius_px", "diameter_mm"):
+            value = getattr(self, name)
+            if value is not None and value[0] >= value[1]:
+                raise ValueError(f"{name} must be [smallest, largest]")
+        return self
+
+    def open(self) -> None:
+        """Read the verifier and compile the kernels."""
+        self._load()
+        self._warm_up()
+
+    def process(self, frame: RgbdFrame, mask: Mask) -> Circles:
+        """Return the circles, the most certain first."""
+        found = self.gather(frame, mask)
+        if found is None:
+            return Circles(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+        order, chance, owner = self.decide(found)
+        shapes = found.shapes[order]
+        polish(found.edges, found.height, found.pixel, shapes, owner)
+        return Circles(shapes[:, :2], equal_area_radius(shapes), chance[order])
+
+    def gather(self, frame: RgbdFrame, mask: Mask) -> Evidence | None:
+        """Return candidates with their features; None where an image cannot hold a circle."""
+        height, width = mask.foreground.shape
+        if min(height, width) < _SMALLEST:
+            return None
+        literal = self.input == "mask"
+        relief = relief_of(frame) if self.use_depth and not literal else None
+        smallest, largest = self._range(relief, height, width)
+        image = _levels(frame, mask, literal)
+        gradient = gradient_of(image)
+        edges = self._edges(image, gradient, _region(mask, relief, literal), relief)
+        cells = vote(
+            edges, rings_between(smallest, largest), (-(-height // CELL), -(-width // CELL))
+        )
+        found = peaks(*summed(cells), self.evidence, smallest, largest, _REACH)
+        high, pixel = (relief.height, relief.pixel) if relief else (NO_RELIEF, 0.0)
+        shapes, hits, residual = refit(edges, high, pixel, found, smallest, largest)
+        table, middle = static_features(
+            image, gradient, mask.foreground.view(np.uint8), high, pixel, shapes, hits, residual
+        )
+        kept = self._plausible(shapes, middle, relief)
+        return Evidence(edges, shapes[kept], hits[kept], table[kept], middle[kept], high, pixel)
+
+    def decide(self, found: Evidence) -> tuple[Rows, Table, Rows]:
+        """Return the accepted rows in their order, all probabilities, and whose each edge is."""
+        verifier = self._load()
+        plain = verifier.mask if self.input == "mask" else verifier.image
+        known = np.isfinite(found.middle)
+        return decide(
+            found.edges, found.shapes, found.hits, found.table, known, plain, verifier.depth,
+            self.min_score,
+        )  # fmt: skip
+
+    def _load(self) -> Verifier:
+        if self._verifier is None:
+            self._verifier = load_verifier(self.verifier)
+        return self._verifier
+
+    def _range(self, relief: Relief | None, height: int, width: int) -> tuple[float, float]:
+        """Return the smallest and largest radius, px, no larger than the image."""
+        smallest, largest = self.radius_px or (8.0, 38.0)
+        if self.radius_px is None and relief is not None:
+            # a cap is nearer than the bed, hence larger in the image
+            smallest, largest = (d / 2000 / relief.pixel for d in self.diameter_mm)
+            smallest, largest = max(5.0, smallest), 1.2 * largest
+        largest = min(largest, max(height, width) / 2)
+        return min(smallest, 0.9 * largest), largest
+
+    def _edges(
+        self, image: Plane, gradient: Gradient, region: Bytes, relief: Relief | None
+    ) -> Edges:
+        otsu = max(otsu_of(gradient.size, _TOP), _FLOOR)
+        edges = edges_of(image, gradient, region, self.edge * otsu, 1.2 * otsu)
+        return fused(edges, relief.edges(), CELL) if relief else edges
+
+    def _plausible(self, shapes: Table, middle: Table, relief: Relief | None) -> NDArray[np.bool_]:
+        """Return which candidates have a possible diameter in metres, or none that is known."""
+        inside = np.ones(len(shapes), bool)
+        if relief is not None:
+            nearer = np.nan_to_num(middle) / relief.focal
+            diameter = 2000 * shapes[:, 2] * (relief.pixel - nearer)
+            low, high = self.diameter_mm
+            inside = ~np.isfinite(middle) | ((diameter >= low) & (diameter <= high))
+        return inside
+
+    def _warm_up(self) -> None:
+        v, u = np.mgrid[:96, :96]
+        disc = (u - 48) ** 2 + (v - 48) ** 2 < 400
+        color = np.repeat((40 + 160 * disc).astype(np.uint8)[..., None], 3, axis=2)
+        from mushpipe import Camera, Header
+
+        camera = Camera(96, 96, 100.0, 100.0, 47.5, 47.5)
+        for native in (np.uint16, np.float32):
+            depth = (500 - 20 * disc).astype(native)
+            frame = RgbdFrame(Header(0, 0, "warm-up"), color, depth, 0.001, camera)
+            self.process(frame, Mask(disc))
+
+
+def equal_area_radius(shapes: Table) -> Table:
+    """Return the radii (N,) of the circles with the area of the outlines (N, 5)."""
+    return np.asarray(np.sqrt(shapes[:, 2] ** 2 + (shapes[:, 3] ** 2 + shapes[:, 4] ** 2) / 2))
+
+
+def _levels(frame: RgbdFrame, mask: Mask, literal: bool) -> Plane:
+    """Return what edges are taken from, (H, W) in 0..255."""
+    image = mask.foreground if literal else frame.gray
+    return np.asarray(image, np.float32) * np.float32(255)
+
+
+def _region(mask: Mask, relief: Relief | None, literal: bool) -> Bytes:
+    """Return where edges are taken: around the mask, and what stands on the bed."""
+    if literal:
+        return np.ones(mask.foreground.shape, np.uint8)
+    region = cv2.dilate(mask.foreground.view(np.uint8), np.ones((7, 7), np.uint8))
+    if relief is not None:
+        height, width = region.shape
+        standing = (relief.height > _STANDING).view(np.uint8)
+        full = cv2.resize(standing, None, fx=CELL, fy=CELL, interpolation=cv2.INTER_NEAREST)
+        region = region | cv2.dilate(full[:height, :width], np.ones((5, 5), np.uint8))
+    return np.asarray(region, np.uint8)

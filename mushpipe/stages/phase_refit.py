@@ -1,0 +1,282 @@
+"""Refit of a candidate to the edge points of its outline, to a fraction of a pixel.
+
+The outline is r(t) = r + p cos 2t + q sin 2t around the centre: a circle, and to first order the
+ellipse of a tilted cap. Its five parameters minimise the distances of the edge points along the
+radius by Gauss-Newton with the weights of Geman & McClure (1987), on fewer and fewer far points.
+The circle of the same area has the radius sqrt(r^2 + (p^2 + q^2) / 2).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mushpipe.core.jit import jit
+from mushpipe.stages.phase_edges import Edges, Plane, Rows, Singles
+from mushpipe.stages.phase_steps import rise, step_up
+
+Shape = NDArray[np.float64]
+Table = NDArray[np.float64]
+DIRECTIONS = 96
+ROUNDS = 3
+REACH = 0.28  # of the radius: how far from the candidate edge points are looked for
+OVAL = 0.06  # of the radius: expected size of p and q
+TURNED = 0.7  # cosine between an edge's normal and the radius
+ALIGNED = 0.8
+PER_DIRECTION = 3
+# Shading inside an outline draws the phase to smaller radii; a second start finds the outer ring.
+STARTS = (1.0, 1.3)
+SAME = 0.04  # of the radius
+BUCKET = 8  # px; cells in which outlines are looked up
+FAINT = 0.15  # share of the outline with edges below which a candidate is given up
+FIRM = 0.9  # share of the outline with edges, from which on no second start is made
+HIDDEN = -3  # in a table of hits: something nearer hides the outline there
+
+
+@jit
+def directions_of(radius: float) -> int:
+    """Return how many directions an outline is looked at in: one every 2 px."""
+    return min(DIRECTIONS, max(24, int(math.pi * radius)))
+
+
+@jit
+def turned(c: float, s: float, cosine: float, sine: float) -> tuple[float, float]:
+    """Return a direction turned by an angle; a recurrence is ten times as fast as cos and sin."""
+    return c * cosine - s * sine, s * cosine + c * sine
+
+
+@jit
+def tolerance(radius: float) -> float:
+    """Return how far (px) from the outline an edge point still supports it."""
+    return max(1.5, 0.07 * radius)
+
+
+@jit
+def gather(edges: Edges, height: Plane, step: float, shape: Shape, coarse: int, rows: Rows) -> int:
+    """Write the rows of edge points around an outline that face its centre; return their number.
+
+    Along each direction the pixels within `REACH` of the outline are looked at, and up to
+    `PER_DIRECTION` edge points taken; none where it is higher outside by `step` (m), for there
+    something nearer hides the outline. `coarse` is by how much fewer directions are looked at.
+    """
+    x, y, radius = shape[0], shape[1], shape[2]
+    lines, width = edges.pixels.shape
+    count, n = 0, max(20, directions_of(radius) // coarse)
+    reach = max(3.0, REACH * radius)
+    cosine, sine = math.cos(2 * math.pi / n), math.sin(2 * math.pi / n)
+    c, s = cosine, -sine
+    for _ in range(n):
+        c, s = turned(c, s, cosine, sine)
+        if len(height) and rise(height, x, y, c, s, radius) > step:
+            continue
+        taken, last = 0, -1
+        for k_t in range(int(2 * reach) + 1):
+            t = radius - reach + k_t
+            u, v = int(x + t * c + 0.5), int(y + t * s + 0.5)
+            if t < 1 or u < 0 or v < 0 or u >= width or v >= lines:
+                continue
+            row = edges.pixels[v, u]
+            if row < 0 or row == last or -(c * edges.nx[row] + s * edges.ny[row]) < TURNED:
+                continue
+            last = row
+            rows[count] = row
+            count += 1
+            taken += 1
+            if taken == PER_DIRECTION or count == len(rows):
+                break
+        if count == len(rows):
+            break
+    return count
+
+
+@jit
+def solve(a: Table, b: Table) -> None:
+    """Solve a x = b in place for a small positive definite matrix; x replaces b."""
+    size = len(b)
+    for i in range(size):
+        for j in range(i + 1, size):
+            factor = a[j, i] / a[i, i]
+            for k in range(i, size):
+                a[j, k] -= factor * a[i, k]
+            b[j] -= factor * b[i]
+    for i in range(size - 1, -1, -1):
+        for k in range(i + 1, size):
+            b[i] -= a[i, k] * b[k]
+        b[i] /= a[i, i]
+
+
+@jit
+def _accumulate(
+    edges: Edges, rows: Rows, count: int, shape: Shape, scale: float,
+    a: Table, b: Table,
+) -> float:  # fmt: skip
+    """Add the normal equations of the edge points to a (5, 5), b (5,); return the sum of weights.
+
+    `shape` is x, y, r, p, q; `scale` the residual (px) at which a weight has fallen to a quarter.
+    """
+    total = 0.0
+    j = np.empty(5)
+    for k in range(count):
+        row = rows[k]
+        dx, dy = edges.x[row] - shape[0], edges.y[row] - shape[1]
+        d = math.sqrt(dx * dx + dy * dy)
+        if d < 1:
+            continue
+        c, s = dx / d, dy / d
+        c2, s2 = c * c - s * s, 2 * s * c
+        e = d - (shape[2] + shape[3] * c2 + shape[4] * s2)
+        facing = -(c * edges.nx[row] + s * edges.ny[row])
+        if facing < TURNED:
+            continue
+        w = edges.weight[row] * facing / (1 + (e / scale) ** 2) ** 2
+        j[0], j[1], j[2], j[3], j[4] = c, s, 1.0, c2, s2
+        for m in range(5):
+            b[m] += w * j[m] * e
+            for n in range(m, 5):
+                a[m, n] += w * j[m] * j[n]
+        total += w
+    return total
+
+
+@jit
+def fit_outline(edges: Edges, rows: Rows, count: int, shape: Shape, times: float) -> bool:
+    """Improve x, y, r, p, q (5,) in place; False where the points do not hold it in place.
+
+    Each point stands for so many `times` points of the outline.
+    """
+    start_x, start_y, start_r = shape[0], shape[1], shape[2]
+    a, b = np.empty((5, 5)), np.empty(5)
+    for turn in range(ROUNDS):
+        scale = max(1.0, (0.16, 0.09, 0.06)[turn] * shape[2])
+        a[:] = 0
+        b[:] = 0
+        if times * _accumulate(edges, rows, count, shape, scale, a, b) < 4:
+            return False
+        prior = 4 / times / max(1.0, (OVAL * shape[2]) ** 2)
+        for m in range(5):
+            for n in range(m):
+                a[m, n] = a[n, m]
+            a[m, m] += 0.3 / times
+        for m in (3, 4):
+            a[m, m] += prior
+            b[m] -= prior * shape[m]
+        solve(a, b)
+        for m in range(5):
+            shape[m] += b[m]
+        moved = math.hypot(shape[0] - start_x, shape[1] - start_y)
+        if moved > max(3.0, 0.4 * start_r) or not 0.6 * start_r < shape[2] < 1.6 * start_r:
+            return False
+    return True
+
+
+@jit
+def outline_hits(edges: Edges, shape: Shape, hits: Rows) -> tuple[int, int, float]:
+    """Write per direction the row of the nearest edge point that supports the outline, else -1.
+
+    Returns:
+        The number of directions, of hits, and the root mean square distance of the hits (px).
+    """
+    height, width = edges.pixels.shape
+    x, y, r = shape[0], shape[1], shape[2]
+    n, near = directions_of(r), tolerance(r)
+    found, squares = 0, 0.0
+    hits[:] = -2
+    cosine, sine = math.cos(2 * math.pi / n), math.sin(2 * math.pi / n)
+    c, s = cosine, -sine
+    for k in range(n):
+        c, s = turned(c, s, cosine, sine)
+        radius = r + shape[3] * (c * c - s * s) + shape[4] * 2 * s * c
+        best, hits[k] = near, -1
+        for step in range(int(2 * near) + 5):  # an edge may be entered up to 3 px within its place
+            t = radius - near - 3 + step
+            u, v = int(x + t * c + 0.5), int(y + t * s + 0.5)
+            if u < 0 or v < 0 or u >= width or v >= height:
+                continue
+            row = edges.pixels[v, u]
+            if row < 0 or -(c * edges.nx[row] + s * edges.ny[row]) < ALIGNED:
+                continue
+            away = abs((edges.x[row] - x) * c + (edges.y[row] - y) * s - radius)
+            if away < best:
+                best, hits[k] = away, row
+        if hits[k] >= 0:
+            found += 1
+            squares += best * best
+    return n, found, math.sqrt(squares / max(found, 1))
+
+
+@jit
+def refit(
+    edges: Edges, height: Plane, pixel: float, candidates: Plane, smallest: float, largest: float
+) -> tuple[Table, Rows, Singles]:
+    """Refit candidates (N, 4) to the edges; those that nothing holds in place are dropped.
+
+    Args:
+        edges: Edge points.
+        height: (h, w) m at half resolution, -1 where unknown; empty without depth.
+        pixel: Size of a pixel at the bed, m.
+        candidates: x, y, radius (px) and magnitude.
+        smallest: Radius, px.
+        largest: Radius, px.
+
+    Returns:
+        Outlines (M, 5), the hits of their directions (M, `DIRECTIONS`), -2 beyond the last
+        direction, and the distances of the hits (M,), px.
+    """
+    n = len(candidates) * len(STARTS)
+    shapes, residual = np.empty((n, 5)), np.empty(n, np.float32)
+    hits = np.full((n, DIRECTIONS), -2, np.int32)
+    rows = np.empty(PER_DIRECTION * DIRECTIONS, np.int32)
+    kept = 0
+    firm, following = np.zeros(len(candidates), np.bool_), np.empty(n, np.int32)
+    height_px, width_px = edges.pixels.shape
+    cells = np.full((height_px // BUCKET + 3, width_px // BUCKET + 3), -1, np.int32)
+    for start in STARTS:
+        for k in range(len(candidates)):
+            if firm[k] or (start > 1 and candidates[k, 2] > 0.95 * largest):
+                continue
+            shape = shapes[kept]
+            shape[0], shape[1] = candidates[k, 0], candidates[k, 1]
+            shape[2] = min(largest, start * candidates[k, 2])
+            shape[3] = shape[4] = 0
+            count = gather(edges, height, step_up(shape[2] * pixel), shape, 2, rows)
+            if count < 5 or not fit_outline(edges, rows, count, shape, 2):
+                continue
+            within = smallest * 0.9 <= shape[2] <= largest * 1.1
+            if not within or _known(shape, shapes, cells, following):
+                continue
+            n, found, residual[kept] = outline_hits(edges, shape, hits[kept])
+            firm[k] = found > FIRM * n
+            if found < FAINT * n:
+                continue
+            row, column = _cell(shape, cells)
+            following[kept], cells[row, column] = cells[row, column], kept
+            kept += 1
+    return shapes[:kept], hits[:kept], residual[:kept]
+
+
+@jit
+def _cell(shape: Shape, cells: Rows) -> tuple[int, int]:
+    """Return row and column of an outline's centre in a grid; places beyond it count as its rim."""
+    row = min(max(int(shape[1] / BUCKET), 1), cells.shape[0] - 2)
+    return row, min(max(int(shape[0] / BUCKET), 1), cells.shape[1] - 2)
+
+
+@jit
+def _known(shape: Shape, others: Table, cells: Rows, following: Rows) -> bool:
+    """Whether another outline is the same but for a few per cent.
+
+    `cells` holds the last outline entered in each cell of a grid, `following` the one before it.
+    """
+    near = max(0.7, SAME * shape[2])
+    row, column = _cell(shape, cells)
+    for v in range(row - 1, row + 2):
+        for u in range(column - 1, column + 2):
+            k = cells[v, u]
+            while k >= 0:
+                away = max(abs(others[k, 0] - shape[0]), abs(others[k, 1] - shape[1]))
+                if max(away, abs(others[k, 2] - shape[2])) < near:
+                    return True
+                k = following[k]
+    return False

@@ -1,0 +1,149 @@
+"""The phase-coded accumulator and its peaks (Atherton & Kerbyson 1999).
+
+T. J. Atherton and D. J. Kerbyson, "Size invariant circle detection", Image and Vision Computing 17
+(1999) 795-803. Every edge point votes along its gradient for the centres of all radii r of the
+range at once, with the complex weight
+
+    exp(i phi(r)) / (2 pi r),    phi(r) = (1 - gap) (2 pi ln(r / Rmin) / ln(Rmax / Rmin) - pi),
+
+their log-coded phase, here with a gap between the phases of Rmax and Rmin so that both cannot be
+taken for each other. The phases of a circle's votes agree at its centre: the magnitude there is the
+share of the outline that voted, whatever its size, and the phase is the radius.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mushpipe.core.jit import jit
+from mushpipe.stages.phase_edges import Edges, Plane, Singles
+
+CELL = 2  # px; the accumulator has half the resolution of the image
+GAP = 0.15
+STEP = 2.0  # px between the radii of an edge point's votes
+
+
+class Rings(NamedTuple):
+    """The radii that are voted for, with their weights.
+
+    Attributes:
+        radius: (K,) px.
+        real: (K,) real part of the weight.
+        imaginary: (K,)
+    """
+
+    radius: Singles
+    real: Singles
+    imaginary: Singles
+
+
+def rings_between(smallest: float, largest: float) -> Rings:
+    """Return radii about `STEP` apart; a full circle's votes then add up to about 1."""
+    count = max(3, math.ceil((largest - smallest) / STEP) + 1)
+    radius = np.linspace(smallest, largest, count)
+    phase = phase_of(radius, smallest, largest)
+    # Of an outline of 2 pi r edge points, each votes once near the centre for its own radius and,
+    # being spread over the 3 x 3 cells that are summed, for the neighbouring radii too.
+    spacing = (largest - smallest) / (count - 1)
+    weight = spacing / (3 * CELL) / (2 * np.pi * radius)
+    parts = radius, weight * np.cos(phase), weight * np.sin(phase)
+    return Rings(*(part.astype(np.float32) for part in parts))
+
+
+def phase_of(radius: NDArray[np.float64], smallest: float, largest: float) -> NDArray[np.float64]:
+    """Return the phase of each radius."""
+    share = np.log(radius / smallest) / math.log(max(largest / smallest, 1.001))
+    return np.asarray((1 - GAP) * (2 * np.pi * share - np.pi))
+
+
+@jit
+def vote(edges: Edges, rings: Rings, shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Return the accumulator (h, w, 2), real and imaginary part per cell."""
+    height, width = shape
+    cells = np.zeros((height, width, 2), np.float32)
+    half = np.float32(1 / CELL)
+    for k in range(len(edges.x)):
+        x, y = (edges.x[k] + np.float32(0.5)) * half, (edges.y[k] + np.float32(0.5)) * half
+        dx, dy, weight = edges.nx[k] * half, edges.ny[k] * half, edges.weight[k]
+        for j in range(len(rings.radius)):
+            u = x + rings.radius[j] * dx
+            v = y + rings.radius[j] * dy
+            if u < 0 or v < 0:
+                continue
+            column, row = int(u), int(v)
+            if column < width and row < height:
+                cells[row, column, 0] += weight * rings.real[j]
+                cells[row, column, 1] += weight * rings.imaginary[j]
+    return cells
+
+
+@jit
+def summed(cells: NDArray[np.float32]) -> tuple[NDArray[np.float32], Plane]:
+    """Return the sums over 3 x 3 cells (h, w, 2) and their magnitude (h, w); 0 at the border."""
+    height, width, _ = cells.shape
+    total = np.zeros_like(cells)
+    size = np.zeros((height, width), np.float32)
+    columns = np.empty((width, 2), np.float32)
+    for y in range(1, height - 1):
+        for x in range(width):
+            for c in range(2):
+                columns[x, c] = cells[y - 1, x, c] + cells[y, x, c] + cells[y + 1, x, c]
+        for x in range(1, width - 1):
+            a = columns[x - 1, 0] + columns[x, 0] + columns[x + 1, 0]
+            b = columns[x - 1, 1] + columns[x, 1] + columns[x + 1, 1]
+            total[y, x, 0], total[y, x, 1] = a, b
+            size[y, x] = np.sqrt(a * a + b * b)
+    return total, size
+
+
+@jit
+def _highest_around(size: Plane, x: int, y: int, reach: int) -> bool:
+    value = size[y, x]
+    for v in range(max(y - reach, 0), min(y + reach + 1, size.shape[0])):
+        for u in range(max(x - reach, 0), min(x + reach + 1, size.shape[1])):
+            other = size[v, u]
+            if other > value or (other == value and (v < y or (v == y and u < x))):
+                return False
+    return True
+
+
+@jit
+def _vertex(before: float, at: float, behind: float) -> float:
+    bend = before - 2 * at + behind
+    if bend > -1e-9:
+        return 0.0
+    return min(0.5, max(-0.5, 0.5 * (before - behind) / bend))
+
+
+@jit
+def peaks(
+    total: NDArray[np.float32], size: Plane, least: float, smallest: float, largest: float,
+    reach: int,
+) -> Plane:  # fmt: skip
+    """Return (N, 4): x, y, radius in px and magnitude of the local maxima of at least `least`.
+
+    A maximum is the highest of the (2 reach + 1)^2 cells around it; its place is the vertex of
+    parabolas. The radius inverts the phase.
+    """
+    height, width = size.shape
+    found = np.empty((height * width // 4 + 1, 4), np.float32)
+    count = 0
+    log_range = math.log(max(largest / smallest, 1.001))
+    for y in range(1, height - 1):
+        for x in range(1, width - 1):
+            if size[y, x] < least or not _highest_around(size, x, y, reach):
+                continue
+            u = x + _vertex(size[y, x - 1], size[y, x], size[y, x + 1])
+            v = y + _vertex(size[y - 1, x], size[y, x], size[y + 1, x])
+            phase = math.atan2(total[y, x, 1], total[y, x, 0]) / (1 - GAP)
+            share = min(1.0, max(0.0, (phase + math.pi) / (2 * math.pi)))
+            found[count, 0] = CELL * (u + 0.5) - 0.5
+            found[count, 1] = CELL * (v + 0.5) - 0.5
+            found[count, 2] = smallest * math.exp(share * log_range)
+            found[count, 3] = size[y, x]
+            count += 1
+    return found[:count]

@@ -1,0 +1,278 @@
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mushpipe import Mask
+from mushpipe.stages.phase_decide import lens, outline_features, overlap_features, probability
+from mushpipe.stages.phase_depth import bed_plane, closed, halved, relief_of
+from mushpipe.stages.phase_edges import Edges, edges_of, gradient_of, otsu_of
+from mushpipe.stages.phase_features import (
+    DEPTH_FEATURES,
+    IMAGE_FEATURES,
+    NAMES,
+    static_features,
+)
+from mushpipe.stages.phase_hough import PhaseHough, equal_area_radius
+from mushpipe.stages.phase_refit import DIRECTIONS, HIDDEN, directions_of
+from mushpipe.stages.phase_votes import GAP, peaks, phase_of, rings_between, summed, vote
+from mushpipe.stages.verifier import load_verifier, weights_of
+from tests.stages.scenes import discs, frame_of, sphere_depth
+
+ALL = np.ones((120, 160), np.uint8)
+NO_HEIGHT = np.zeros((0, 0), np.float32)
+
+
+def gray_of(image: np.ndarray) -> np.ndarray:
+    return (image * 255).astype(np.float32)
+
+
+def edges(image: np.ndarray, threshold: float = 5.0) -> Edges:
+    gray = gray_of(image)
+    return edges_of(gray, gradient_of(gray), ALL, threshold, threshold)
+
+
+def static_row(
+    image: np.ndarray,
+    shape: tuple[float, float, float],
+    mask: np.ndarray | None = None,
+    height: np.ndarray = NO_HEIGHT,
+) -> tuple[dict[str, float], np.ndarray]:
+    gray = gray_of(image)
+    hits = np.full((1, DIRECTIONS), -2, np.int32)
+    hits[0, : directions_of(shape[2])] = -1
+    covered = ALL if mask is None else mask.astype(np.uint8)
+    outline = np.array([[*shape, 0.0, 0.0]])
+    residual = np.array([0.5], np.float32)
+    table, _ = static_features(
+        gray, gradient_of(gray), covered, height, 0.002, outline, hits, residual
+    )
+    return dict(zip(NAMES, table[0], strict=True)), hits[0]
+
+
+def test_the_gradient_of_a_ramp_is_its_slope() -> None:
+    v, u = np.mgrid[:40, :50].astype(np.float32)
+    grad = gradient_of(3 * u - 2 * v)
+    inner = (slice(5, -5), slice(5, -5))
+    assert grad.x[inner] == pytest.approx(3, abs=1e-4)
+    assert grad.y[inner] == pytest.approx(-2, abs=1e-4)
+    assert grad.size[inner] == pytest.approx(math.sqrt(13), abs=1e-4)
+
+
+def test_edges_lie_on_the_outline_and_point_to_the_bright_side() -> None:
+    found = edges(discs([(80.3, 60.6, 20.0)], 0.8, 0.1))
+    dx, dy = found.x - 80.3, found.y - 60.6
+    distance = np.hypot(dx, dy)
+    assert len(found.x) > 100
+    assert distance == pytest.approx(20, abs=0.15)
+    assert (-(dx * found.nx + dy * found.ny) / distance).min() > 0.99
+
+
+def test_an_edge_between_bright_surfaces_is_moved_outwards() -> None:
+    dark = edges(discs([(80, 60, 20)], 0.8, 0.1))
+    pale = edges(discs([(80, 60, 20)], 0.8, 0.6))
+    assert np.hypot(pale.x - 80, pale.y - 60).mean() > np.hypot(dark.x - 80, dark.y - 60).mean() + 1
+    assert pale.weight.max() < dark.weight.min()
+
+
+def test_otsu_of_two_levels_lies_between_them() -> None:
+    size = np.full((20, 20), 2.0, np.float32)
+    size[:10] = 20
+    assert 2 < otsu_of(size, 64.0) < 20
+
+
+def test_phases_of_the_smallest_and_largest_radius_leave_a_gap() -> None:
+    low, high = phase_of(np.array([8.0, 38.0]), 8, 38)
+    assert high - low == pytest.approx(2 * np.pi * (1 - GAP))
+    assert low == pytest.approx(-high)
+
+
+@pytest.mark.parametrize("radius", [9.0, 17.0, 34.0])
+def test_the_peak_of_a_full_circle_is_about_one_and_its_phase_the_radius(radius: float) -> None:
+    found = edges(discs([(80, 60, radius)], 0.8, 0.1))
+    total, size = summed(vote(found, rings_between(8, 38), (60, 80)))
+    best = max(peaks(total, size, 0.2, 8, 38, 3).tolist(), key=lambda peak: peak[3])
+    assert best[:3] == pytest.approx([80, 60, radius], abs=1.2)
+    assert 0.6 < best[3] < 1.4
+
+
+def test_the_circle_of_an_outline_has_its_area() -> None:
+    turn = np.linspace(0, 2 * np.pi, 20_000, endpoint=False)
+    r = 20 + 2 * np.cos(2 * turn) - 1.5 * np.sin(2 * turn)
+    area = 0.5 * (r**2).mean() * 2 * np.pi
+    radius = equal_area_radius(np.array([[0, 0, 20, 2, -1.5]]))
+    assert np.pi * radius**2 == pytest.approx(area)
+
+
+def test_lens_by_hand() -> None:
+    assert lens(5.0, 2.0, 3.0) == 0
+    assert lens(0.5, 2.0, 3.0) == pytest.approx(4 * np.pi)
+    assert lens(1.0, 1.0, 1.0) == pytest.approx(2 * np.pi / 3 - np.sqrt(3) / 2)
+
+
+def test_overlap_features_by_hand() -> None:
+    row = np.zeros(7)
+    small = np.array([0.0, 0, 10, 0, 0])
+    overlap_features(small, np.array([[0.0, 0, 20, 0, 0], [100, 0, 5, 0, 0]]), row)
+    assert row[4:] == pytest.approx([1.0, 0.25, 0.25])
+
+
+def test_a_direction_under_an_accepted_circle_is_not_free() -> None:
+    image = discs([(80, 60, 20)], 0.8, 0.1)
+    found = edges(image)
+    shape = np.array([80.0, 60, 20, 0, 0])
+    n = directions_of(20)
+    hits = np.full(DIRECTIONS, -2, np.int32)
+    hits[:n] = -1
+    hits[: n // 4] = 0
+    hits[n // 4 : n // 2] = HIDDEN
+    row, owner = np.zeros(7), np.full(len(found.x), -1, np.int32)
+    outline_features(found, shape, hits, owner, np.zeros((0, 5)), row)
+    quarter = (n // 4) / n
+    hidden = (n // 2 - n // 4) / n
+    assert row[0] == pytest.approx(1 - hidden)
+    assert row[1] == pytest.approx(quarter / (1 - hidden))
+    assert row[3] == pytest.approx(math.log(1 + n // 4))
+    above = np.array([[80.0, 45, 16, 0, 0]])
+    outline_features(found, shape, hits, owner, above, row)
+    assert row[0] < 1 - hidden
+    owner[0] = 1
+    outline_features(found, shape, hits, owner, np.zeros((0, 5)), row)
+    assert row[1] == row[2] == row[3] == 0
+
+
+def test_image_features_of_a_disc_by_hand() -> None:
+    image = discs([(80, 60, 20)], 0.8, 0.2)
+    left = np.zeros(image.shape, bool)
+    left[:, :80] = True
+    row, _ = static_row(image, (80, 60, 20), left)
+    assert row["cover"] == pytest.approx(0.5, abs=0.06)
+    assert row["coherence"] > 0.9
+    expected = (0.8 - 0.2) * 255 / ((0.8 + 0.2) * 255 + 8)
+    assert row["contrast"] == pytest.approx(expected, abs=0.01)
+    assert row["darkest"] == pytest.approx(expected, abs=0.01)
+    assert row["texture"] == pytest.approx(0, abs=0.01)
+    assert row["residual"] == pytest.approx(0.5 / 20)
+
+
+def test_a_flat_image_has_no_coherence_and_no_contrast() -> None:
+    row, _ = static_row(np.full((120, 160), 0.5), (80, 60, 20))
+    assert row["coherence"] == pytest.approx(0, abs=1e-6)
+    assert row["contrast"] == pytest.approx(0, abs=1e-6)
+
+
+def test_curvatures_tell_a_ball_from_a_stem_and_from_paper() -> None:
+    v, u = np.mgrid[:60, :80].astype(float)
+    x, y = (2 * u + 0.5 - 80) * 0.002, (2 * v + 0.5 - 60) * 0.002
+    radius = 20 * 0.002
+    ball = np.sqrt(np.maximum(radius**2 * 1.2 - x**2 - y**2, 0)).astype(np.float32)
+    stem = np.sqrt(np.maximum(radius**2 * 1.2 - y**2, 0)).astype(np.float32)
+    paper = np.full_like(ball, 0.02)
+    image = np.full((120, 160), 0.5)
+    small, large = {}, {}
+    for name, height in (("ball", ball), ("stem", stem), ("paper", paper)):
+        row, _ = static_row(image, (80, 60, 20), None, height)
+        small[name], large[name] = row["bend_small"], row["bend_large"]
+    assert small["ball"] == pytest.approx(large["ball"], abs=0.05)
+    assert 0.7 < small["ball"] < 1.5
+    assert small["stem"] == pytest.approx(0, abs=0.05)
+    assert large["stem"] > 0.7
+    assert large["paper"] == pytest.approx(0, abs=0.01)
+
+
+def test_height_drop_and_rise_by_hand() -> None:
+    v, u = np.mgrid[:60, :80]
+    height = np.where(np.hypot(2 * u - 80, 2 * v - 60) <= 20, 0.03, 0.0).astype(np.float32)
+    height[:, :15] = 0.08
+    row, hits = static_row(np.full((120, 160), 0.5), (80, 60, 20), None, height)
+    assert row["height"] == pytest.approx(0.03 / (0.03 + 0.04), abs=0.01)
+    assert row["drop"] == 1
+    assert row["rise"] == 0
+    height[:, :31] = 0.08
+    row, hits = static_row(np.full((120, 160), 0.5), (80, 60, 20), None, height)
+    assert 0.1 < row["rise"] < 0.5
+    assert (hits == HIDDEN).sum() > 5
+
+
+def test_missing_depth_switches_the_features_of_depth_off() -> None:
+    row, _ = static_row(np.full((120, 160), 0.5), (80, 60, 20), None, np.full((60, 80), -1.0, "f4"))
+    assert [row[name] for name in DEPTH_FEATURES if name != "gap"] == [0] * 6
+    assert row["gap"] == 1
+
+
+def test_a_bed_is_found_below_a_ball_and_at_a_slant() -> None:
+    ball = sphere_depth((0.0, 0.0, 0.4), 0.04, 9.0)
+    slant = 1 / (1 / 0.42 - 0.5 * ((np.arange(160) + 0.5) / 160 - 0.5))
+    depth = np.minimum(ball, slant[None])
+    small = halved(depth.astype(np.float32), 1.0)
+    plane = bed_plane(small)
+    assert plane is not None
+    u = (np.arange(80) + 0.5) / 80 - 0.5
+    middle = 1 / (plane[0] + plane[1] * u)
+    assert middle == pytest.approx(1 / (1 / 0.42 - 0.5 * u), abs=0.0005)
+
+
+def test_heights_of_a_ball_over_the_bed() -> None:
+    image = np.full((120, 160), 0.5)
+    frame = frame_of(image, sphere_depth((0.0, 0.0, 0.4), 0.04, 0.42))
+    relief = relief_of(frame)
+    assert relief is not None
+    assert relief.height.max() == pytest.approx(0.06, abs=0.003)
+    assert np.median(relief.height) == pytest.approx(0, abs=0.002)
+
+
+def test_small_gaps_close_at_the_lower_end_and_wide_ones_stay() -> None:
+    height = np.full((3, 40), 0.02, np.float32)
+    height[:, 10:] = 0.0
+    height[:, 8:12] = -1
+    height[:, 20:35] = -1
+    out = closed(height)
+    assert (out[:, 8:12] == 0).all()
+    assert (out[:, 20:35] == -1).all()
+
+
+def test_the_probability_is_the_logistic_of_the_weighted_features() -> None:
+    model = {
+        "intercept": -0.5,
+        "features": {"support": {"mean": 0.5, "scale": 0.25, "weight": 1.0, "square": -0.2}},
+    }
+    row = np.zeros(len(NAMES))
+    row[NAMES.index("support")] = 0.75
+    logit = -0.5 + 1.0 * 1 - 0.2 * 1
+    assert probability(row, weights_of(model)) == pytest.approx(1 / (1 + math.exp(-logit)))
+
+
+def test_the_verifier_of_the_package_names_known_features_only() -> None:
+    verifier = load_verifier()
+    first_depth = len(IMAGE_FEATURES)
+    for weights in (verifier.image, verifier.mask):
+        assert not weights[first_depth:-1, 2:].any()
+    assert verifier.depth[first_depth:-1, 2:].any()
+    assert np.isfinite(verifier.depth).all()
+    assert (verifier.depth[:, 1] > 0).all()
+
+
+def test_a_verifier_with_an_unknown_feature_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "verifier.yaml"
+    model = "{intercept: 0, features: {luck: {mean: 0, scale: 1, weight: 1, square: 0}}}"
+    path.write_text(f"models: {{image: {model}, depth: {model}, mask: {model}}}")
+    with pytest.raises(ValueError, match="unknown features"):
+        load_verifier(path)
+    path.write_text("models: {}")
+    with pytest.raises(ValueError, match="lacks the models"):
+        load_verifier(path)
+
+
+def test_every_candidate_has_all_features_and_a_probability() -> None:
+    image = discs([(40, 60, 15), (62, 60, 14)], 0.8, 0.15)
+    stage = PhaseHough()
+    found = stage.gather(frame_of(image), Mask(image > 0.5))
+    assert found is not None
+    order, chance, owner = stage.decide(found)
+    assert found.table.shape == (len(found.shapes), len(NAMES))
+    assert np.isfinite(found.table).all()
+    assert ((chance >= 0) & (chance <= 1)).all()
+    assert set(owner.tolist()) <= {-1, *range(len(order))}

@@ -1,0 +1,99 @@
+"""Judge `phase-hough` on labelled real recordings: `python -m training.field FOLDER`.
+
+The folder holds recordings with labels beside them (`name.mcap`, `name.labels.json`); nothing is
+trained on them. Each recording is segmented with and without `flatten`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mushpipe import Circles, Mask, RgbdFrame
+from mushpipe.sources.mcap import McapSource
+from mushpipe.stages.phase_hough import PhaseHough
+from training.matching import IOU, Floats, circle_iou
+from training.verifier import segmentations
+
+RANGES: dict[str, dict[str, Any]] = {
+    "white-bed": {"radius_px": (8, 45)},
+    "desk": {"radius_px": None, "diameter_mm": (10, 120)},
+    "beds": {"radius_px": (8, 60)},
+}
+
+
+def labelled(labels: dict[str, Any], stamp_ns: int) -> tuple[Floats, Floats] | None:
+    """Return circles (N, 3) that must and circles (M, 3) that may be found; None if unlabelled."""
+    must, may = [], []
+    if "must_find" in labels:
+        must = [(c["cx"], c["cy"], c["diam_silhouette"] / 2) for c in labels["must_find"]]
+        may = [(c["cx"], c["cy"], c["r"]) for c in labels["may_find"]]
+    elif "frames" in labels:
+        frame = next(f for f in labels["frames"] if f["stamp_ns"] == stamp_ns)
+        boxes = [c["bbox"] for c in frame["caps"]]
+        must = [(x + w / 2, y + h / 2, np.sqrt(w * h) / 2) for x, y, w, h in boxes]
+    elif labels["stamp_ns"] != stamp_ns:
+        return None
+    else:
+        for cap in labels["caps"]:
+            (may if cap["ignore"] else must).append((cap["u"], cap["v"], cap["radius_px"]))
+    return np.array(must).reshape(-1, 3), np.array(may).reshape(-1, 3)
+
+
+def result(circles: Circles, must: Floats, may: Floats) -> str:
+    """Return what was found, missed and false as text."""
+    from scipy.optimize import linear_sum_assignment
+
+    iou = circle_iou(circles.center, circles.radius, must[:, :2], must[:, 2])
+    rows, columns = linear_sum_assignment(np.where(iou >= IOU, -iou, 1.0))
+    right = int((iou[rows, columns] >= IOU).sum())
+    left = np.setdiff1d(np.arange(len(circles)), rows[iou[rows, columns] >= IOU])
+    away = np.linalg.norm(circles.center[left][:, None] - may[None, :, :2], axis=2)
+    false = int((~(away <= may[None, :, 2]).any(axis=1)).sum())
+    f = 2 * right / max(1, right + len(must) + false)
+    on_cap = [bool((np.hypot(*(circles.center - m[:2]).T) < m[2]).any()) for m in must]
+    return f"{right} of {len(must)}, false {false}, F {f:.3f}; on a cap {sum(on_cap)}"
+
+
+def judge(path: Path) -> Iterator[str]:
+    """Yield a line per labelled frame, segmentation and use of depth."""
+    labels = json.loads(path.with_suffix(".labels.json").read_text())
+    settings = next(v for k, v in RANGES.items() if path.stem.startswith(k))
+    source = McapSource(path=path)
+    source.open()
+    for frame in source.frames():
+        wanted = labelled(labels, frame.header.stamp_ns)
+        if wanted is None:
+            continue
+        for name, (ready, mask) in zip(("flat", "plain"), segmentations(frame), strict=True):
+            for depth in (True, False) if frame.depth is not None else (False,):
+                circles = detect(ready, mask, settings, depth)
+                kind = "depth" if depth else "image"
+                text = result(circles, *wanted)
+                yield f"{path.stem:18} #{frame.header.sequence} {name:5} {kind}: {text}"
+
+
+def detect(frame: RgbdFrame, mask: Mask, settings: dict[str, Any], depth: bool) -> Circles:
+    """Run the detector; without depth, a range in metres becomes one in pixels."""
+    chosen = dict(settings, use_depth=depth)
+    if not depth and chosen["radius_px"] is None:
+        chosen["radius_px"] = (15, 90)
+    return PhaseHough(**chosen).process(frame, mask)
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    for path in sorted(parser.parse_args().folder.glob("*.labels.json")):
+        for line in judge(path.with_name(path.name.replace(".labels.json", ".mcap"))):
+            print(line)
+
+
+if __name__ == "__main__":
+    main()

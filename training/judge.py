@@ -1,0 +1,111 @@
+"""Judge `phase-hough` on simulated scenes it was not made from: `python -m training.judge`.
+
+Prints, per condition, F with and without depth and of the literal variant on the mask, beside
+OpenCV's Hough transform on the same frames and masks, and the errors of centre and radius.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import defaultdict
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from mushpipe import Circles, Mask, RgbdFrame, Stage
+from mushpipe.stages.hough import Hough
+from mushpipe.stages.phase_hough import PhaseHough
+from training.matching import Score, counted
+from training.scenes import Case, choosing_cases, judging_cases
+from training.verifier import RADII, segmentations
+
+DETECTORS: dict[str, Stage] = {
+    "depth": PhaseHough(radius_px=RADII),
+    "image": PhaseHough(radius_px=RADII, use_depth=False),
+    "mask": PhaseHough(radius_px=RADII, input="mask"),
+    "cv-alt": Hough(radius_px=RADII),
+    "cv-gradient": Hough(radius_px=RADII, method="gradient"),
+    "cv-mask": Hough(radius_px=RADII, method="gradient", input="mask"),
+}
+
+
+def detect(stage: Stage, frame: RgbdFrame, mask: Mask) -> Circles:
+    """Run a detector on a frame."""
+    circles: Circles = stage.process(frame, mask)  # type: ignore[attr-defined]
+    return circles
+
+
+def judge(cases: Iterable[Case], names: list[str]) -> dict[tuple[str, str], Score]:
+    """Return the score of each detector in each condition."""
+    scores: dict[tuple[str, str], Score] = defaultdict(Score)
+    for case in cases:
+        frame, mask = segmentations(case.frame)[0]
+        counts = counted(case.truth, *RADII)
+        for name in names:
+            circles = detect(DETECTORS[name], frame, mask)
+            scores[case.condition, name].add(circles, case.truth, counts)
+    return scores
+
+
+def table(scores: dict[tuple[str, str], Score], names: list[str]) -> str:
+    """Return the figures as text."""
+    conditions = list(dict.fromkeys(c for c, _ in scores))
+    lines = ["F (recall/precision) in per cent; errors in px of caps visible to at least a half"]
+    lines.append(f"{'':10}" + "".join(f"{name:>20}" for name in names))
+    for condition in conditions:
+        row = [scores[condition, name] for name in names]
+        cells = (f"{s.f:.3f} ({s.recall:.2f}/{s.precision:.2f})" for s in row)
+        lines.append(f"{condition:10}" + "".join(f"{cell:>20}" for cell in cells))
+    for name in names:
+        whole = Score()
+        for condition in conditions:
+            whole.merge(scores[condition, name])
+        lines.append(f"{name:12} all: F {whole.f:.4f}, " + errors(whole))
+    return "\n".join(lines)
+
+
+def errors(score: Score) -> str:
+    """Return centre and radius errors as text."""
+    if not score.errors:
+        return "no match"
+    away, larger, visible, _ = np.array(score.errors).T
+    half = visible >= 0.5
+    return (
+        f"centre median {np.median(away[half]):.2f} p95 {np.percentile(away[half], 95):.2f}, "
+        f"radius bias {np.median(larger[half]):+.2f} mean {larger[half].mean():+.2f}"
+    )
+
+
+def reliability(score: Score, bins: int = 5) -> str:
+    """Return mean score and share of right circles per bin of the score."""
+    values = np.array(score.reliability)
+    lines = []
+    for low in np.linspace(0.5, 1, bins, endpoint=False):
+        part = values[(values[:, 0] >= low) & (values[:, 0] < low + 0.5 / bins + 1e-9)]
+        if len(part):
+            score, right = part.mean(axis=0)
+            lines.append(f"  score {score:.2f}: right {right:.2f} of {len(part)}")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cache", type=Path, default=Path("out/scenes"), help="rendered frames")
+    parser.add_argument("--choosing", action="store_true", help="the frames for choices of design")
+    parser.add_argument("--detectors", nargs="+", default=list(DETECTORS), choices=DETECTORS)
+    arguments = parser.parse_args()
+    cases = (choosing_cases if arguments.choosing else judging_cases)(arguments.cache)
+    scores = judge(cases, arguments.detectors)
+    print(table(scores, arguments.detectors))
+    for name in arguments.detectors:
+        whole = Score()
+        for (_, detector), score in scores.items():
+            if detector == name:
+                whole.merge(score)
+        print(name, reliability(whole), sep="\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,91 @@
+"""Which circle is which cap: exact circle IoU of at least 0.5, Hungarian, ignored ones neutral."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from mushpipe import Circles
+from mushpipe.core.truth import Truth
+
+Floats = NDArray[np.float64]
+IOU = 0.5
+
+
+def circle_iou(center: Floats, radius: Floats, others: Floats, radii: Floats) -> Floats:
+    """Return the IoU (N, M) of circles with other circles."""
+    d = np.linalg.norm(center[:, None] - others[None], axis=2)
+    a, b = np.broadcast_arrays(radius[:, None], radii[None])
+    meets = (d < a + b) & (d > np.abs(a - b))
+    e = np.where(meets, d, 1.0)
+    first = a * a * np.arccos(np.clip((e * e + a * a - b * b) / (2 * e * a), -1, 1))
+    second = b * b * np.arccos(np.clip((e * e + b * b - a * a) / (2 * e * b), -1, 1))
+    kite = (a + b - e) * (e + a - b) * (e - a + b) * (e + a + b)
+    shared = np.where(meets, first + second - np.sqrt(np.maximum(kite, 0)) / 2, 0.0)
+    shared = np.where(d <= np.abs(a - b), np.pi * np.minimum(a, b) ** 2, shared)
+    return np.asarray(shared / (np.pi * (a * a + b * b) - shared))
+
+
+def counted(truth: Truth, smallest: float, largest: float) -> NDArray[np.bool_]:
+    """Return which caps must be found, for a detector of a range of radii (px)."""
+    return (truth.ignore == 0) & (truth.radius >= smallest) & (truth.radius <= largest)
+
+
+@dataclass
+class Score:
+    """Counts over frames, and the errors of what was matched.
+
+    `errors` holds centre error, radius error, share visible and true radius of each match;
+    `reliability` score and 1 or 0 of each circle that is right or wrong.
+    """
+
+    right: int = 0
+    missed: int = 0
+    false: int = 0
+    errors: list[tuple[float, float, float, float]] = field(default_factory=list)
+    reliability: list[tuple[float, float]] = field(default_factory=list)
+
+    def add(self, circles: Circles, truth: Truth, counts: NDArray[np.bool_]) -> None:
+        """Match the circles of a frame with its truth."""
+        iou = circle_iou(circles.center, circles.radius, truth.center, truth.radius)
+        rows, columns = linear_sum_assignment(np.where(iou[:, counts] >= IOU, -iou[:, counts], 1.0))
+        columns = np.flatnonzero(counts)[columns]
+        good = iou[rows, columns] >= IOU
+        rows, columns = rows[good], columns[good]
+        neutral = (iou[:, ~counts] >= IOU).any(axis=1)
+        wrong = np.setdiff1d(np.flatnonzero(~neutral), rows)
+        self.right += len(rows)
+        self.missed += int(counts.sum()) - len(rows)
+        self.false += len(wrong)
+        away = np.linalg.norm(circles.center[rows] - truth.center[columns], axis=1)
+        larger = circles.radius[rows] - truth.radius[columns]
+        self.errors += zip(away, larger, truth.visible[columns], truth.radius[columns], strict=True)
+        self.reliability += [(s, 1.0) for s in circles.score[rows]]
+        self.reliability += [(s, 0.0) for s in circles.score[wrong]]
+
+    def merge(self, other: Score) -> None:
+        """Add the counts of another score."""
+        self.right += other.right
+        self.missed += other.missed
+        self.false += other.false
+        self.errors += other.errors
+        self.reliability += other.reliability
+
+    @property
+    def recall(self) -> float:
+        """Share of the caps that were found."""
+        return self.right / max(1, self.right + self.missed)
+
+    @property
+    def precision(self) -> float:
+        """Share of the circles that are right."""
+        return self.right / max(1, self.right + self.false)
+
+    @property
+    def f(self) -> float:
+        """Harmonic mean of recall and precision; 1 where there is nothing and nothing was found."""
+        wrong = self.missed + self.false
+        return 2 * self.right / (2 * self.right + wrong) if self.right + wrong else 1.0

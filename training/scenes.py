@@ -1,0 +1,96 @@
+"""Simulated scenes by name, for training (family a), choosing (family a) and judging (family b)."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mushpipe import RgbdFrame
+from mushpipe.core.truth import TRUTH_TOPIC, Truth
+from mushpipe.sources.synthetic import SyntheticSource
+
+CONDITIONS: dict[str, dict[str, Any]] = {
+    "even": {},
+    "gradient": {"light": "gradient", "light_strength": 0.95},
+    "dense": {"count": 150, "cluster": 1.0},
+    "brown": {"cap_color": "brown"},
+    "tilted": {"tilt_deg": (10, 40), "stumps": 4},
+    "fallen": {"tilt_deg": (10, 40), "stumps": 6, "fallen": 3},
+    "mixed": {"cap_color": "mixed"},
+    "cream": {"cap_color": "cream", "tray": True},
+    "side": {"light": "side"},
+    "spot": {"light": "spot"},
+    "harsh": {"light": "harsh"},
+    "near": {"distance": 0.32, "count": 35},
+    "far": {"distance": 0.8, "count": 150},
+    "oblique": {"camera_tilt_deg": 18, "tilt_deg": (5, 40)},
+    "lab": {"scene": "lab", "count": 9},
+    "cloth": {"scene": "lab", "count": 9, "table": "cloth"},
+    "paint": {"scene": "lab", "count": 9, "table": "paint"},
+    "empty": {"count": 0, "mycelium": 1.0, "stumps": 8},
+    "bare": {"scene": "lab", "count": 1, "clutter": 12},
+}
+
+# How many frames of each condition a training run takes, seeds from 0 on.
+TRAINING = {
+    "even": 8, "gradient": 5, "dense": 8, "brown": 6, "tilted": 8, "mixed": 4, "cream": 2,
+    "side": 3, "spot": 2, "harsh": 4, "near": 4, "far": 3, "oblique": 4, "lab": 4, "cloth": 2,
+    "paint": 2, "empty": 3, "bare": 3, "fallen": 6,
+}  # fmt: skip
+CHOOSING = {
+    "even": 3, "gradient": 3, "dense": 3, "brown": 3, "tilted": 4, "harsh": 2, "near": 1,
+    "oblique": 1, "lab": 2, "empty": 1, "bare": 1, "fallen": 2,
+}  # fmt: skip
+JUDGED = ("even", "gradient", "dense", "brown", "tilted", "side", "harsh", "lab", "empty", "bare",
+          "fallen")  # fmt: skip
+CHOOSING_SEED, JUDGING_SEED = 900, 5000
+
+
+@dataclass(frozen=True)
+class Case:
+    """One simulated frame with its truth."""
+
+    condition: str
+    family: str
+    seed: int
+    frame: RgbdFrame
+    truth: Truth
+
+
+def render(condition: str, family: str, seed: int, cache: Path) -> Case:
+    """Return a frame, from the cache folder where it was rendered before."""
+    path = cache / f"{condition}-{family}-{seed}.pickle"
+    if path.exists():
+        case: Case = pickle.loads(path.read_bytes())
+        return case
+    settings = CONDITIONS[condition] | {"seed": seed, "shape_family": family, "max_frames": 1}
+    frame = next(iter(SyntheticSource(**settings).frames()))
+    case = Case(condition, family, seed, frame, frame.attached[TRUTH_TOPIC])
+    cache.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(pickle.dumps(case))
+    return case
+
+
+def training_cases(cache: Path) -> Iterator[Case]:
+    """Yield the frames that the verifier is trained on."""
+    for number, (condition, count) in enumerate(TRAINING.items()):
+        for k in range(count):
+            yield render(condition, "a", 20 * number + k, cache)
+
+
+def choosing_cases(cache: Path) -> Iterator[Case]:
+    """Yield frames for choices of design: the family that was trained on, other seeds."""
+    for number, (condition, count) in enumerate(CHOOSING.items()):
+        for k in range(count):
+            yield render(condition, "a", CHOOSING_SEED + 5 * number + k, cache)
+
+
+def judging_cases(cache: Path, count: int = 3) -> Iterator[Case]:
+    """Yield frames for judging only: per condition `count` of each family, unseen seeds."""
+    for number, condition in enumerate(JUDGED):
+        for family in "ab":
+            for k in range(count):
+                yield render(condition, family, JUDGING_SEED + 20 * number + k, cache)
