@@ -193,8 +193,11 @@ class RealsenseSource(ReplaySource):
 
     def _connect(self) -> Link:
         """Open and start the recording, or the camera with its settings."""
-        link = self._open_file(self.file) if self.file else self._open_camera()
-        link.start()
+        try:
+            link = self._open_file(self.file) if self.file else self._open_camera()
+            link.start()
+        except RuntimeError as error:  # a camera that goes while it is set up, for instance
+            raise DeviceError(f"librealsense says: {error}") from error
         return link
 
     def _open_file(self, path: Path) -> FileLink:

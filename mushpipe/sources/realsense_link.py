@@ -77,12 +77,18 @@ class CameraLink:
         return frame.as_frameset() if arrived and frame.is_frameset() else None
 
     def check(self, quiet_s: float, patience_s: float) -> None:
-        """Raise CameraLostError where the camera is gone, or was silent for longer than the patience."""
-        known = {info(d).get("serial_number") for d in self._context.query_devices()}
-        if self.serial not in known:
+        """Raise CameraLostError where the camera is gone, or was silent beyond the patience."""
+        if not self._connected():
             raise CameraLostError("it was unplugged")
         if quiet_s >= patience_s:
             raise CameraLostError(f"it is connected but sent no image for {patience_s:g} s")
+
+    def _connected(self) -> bool:
+        try:
+            devices = self._context.query_devices()
+            return self.serial in {info(device).get("serial_number") for device in devices}
+        except RuntimeError:  # it goes while it is asked
+            return False
 
     def ended(self) -> bool:
         """Return whether no more frames can come."""
