@@ -21,7 +21,8 @@ UDEV_RULE = (
     'SUBSYSTEMS=="usb", ATTRS{{idVendor}}=="8086", ATTRS{{idProduct}}=="{product}", '
     'MODE:="0666", GROUP:="plugdev"'
 )
-_USB = {"0aa5": "SR300", "0b48": "SR305"}
+USB = Path("/sys/bus/usb/devices")
+_NAMES = {"0aa5": "SR300", "0b48": "SR305"}
 _INFO = ("name", "serial_number", "firmware_version", "usb_type_descriptor", "product_line")
 
 
@@ -36,7 +37,7 @@ def knows_sr300() -> bool:
     return (major, minor) < (2, 55)
 
 
-def cameras_on_usb(root: Path = Path("/sys/bus/usb/devices")) -> Iterator[tuple[str, str]]:
+def cameras_on_usb(root: Path) -> Iterator[tuple[str, str]]:
     """Yield product id and name of every RealSense on USB, whether it can be opened or not."""
     for folder in sorted(root.glob("*")):
         with suppress(OSError):  # a device may vanish while it is looked at
@@ -45,11 +46,11 @@ def cameras_on_usb(root: Path = Path("/sys/bus/usb/devices")) -> Iterator[tuple[
             product, name = (folder / "idProduct").read_text().strip(), ""
             with suppress(OSError):
                 name = (folder / "product").read_text().strip()
-            if product in _USB or "realsense" in name.lower():
-                yield product, _USB.get(product, name)
+            if product in _NAMES or "realsense" in name.lower():
+                yield product, _NAMES.get(product, name)
 
 
-def no_camera(root: Path = Path("/sys/bus/usb/devices")) -> DeviceError:
+def no_camera(root: Path) -> DeviceError:
     """Return the error that says why librealsense sees no camera, as far as that can be told."""
     lines = ["no RealSense camera is connected; plug it into a USB 3 port"]
     for product, name in cameras_on_usb(root):
@@ -79,9 +80,10 @@ def find_device(context: Any, serial: str | None) -> Any:
     """
     devices = [device for device in context.query_devices() if has_depth(device)]
     if not devices:
-        raise no_camera()
+        raise no_camera(USB)
     known = [info(device).get("serial_number", "") for device in devices]
-    listed = ", ".join(f"{info(d).get('name')} {info(d).get('serial_number')}" for d in devices)
+    told = sorted(f"{info(d).get('name')} {info(d).get('serial_number')}" for d in devices)
+    listed = ", ".join(told)
     if serial is None:
         if len(devices) > 1:
             raise UsageError(f"several cameras are connected, set source.serial: {listed}")

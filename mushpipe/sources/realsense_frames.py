@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.errors import InputError
+from mushpipe.core.geometry import Camera
 from mushpipe.core.libraries import import_realsense
 from mushpipe.core.tables import Columns, column
 from mushpipe.core.types import Header, RgbdFrame
@@ -23,8 +24,7 @@ from mushpipe.sources.realsense_link import Link
 FRAME_ID = "camera_color_optical_frame"
 CLOCK_TOPIC = "/camera/clock"
 LOST = "frames lost between the sensor and this program"
-INCOMPLETE = "colour images without depth, or depth without colour"
-REPEATED = "pairs with an image that was there before"
+UNPAIRED = "colour or depth images without a partner"
 AWAY = "ms without the camera"
 # librealsense's formats, as ROS calls them
 _ENCODINGS = {
@@ -91,6 +91,7 @@ class FrameMaker:
         self._scale = 0.001
         if self._has_depth:
             self._scale = link.profile.get_device().first_depth_sensor().get_depth_scale()
+            self._gain, self._shift = _along_color_axis(streams, self._camera, self._scale)
         self._live = link.live
         self._to_skip = self._warm_up if link.live else 0
         self._numbers: dict[str, int] = {}
@@ -99,7 +100,7 @@ class FrameMaker:
         self._resumed = self._last_arrival_ns > 0
 
     def make(self, frames: Any, arrival_ns: int) -> RgbdFrame | None:
-        """Turn a frameset into a frame; None where it is incomplete, repeated, or warm-up.
+        """Turn a frameset into a frame; None where a partner is missing, and in the warm-up.
 
         Args:
             frames: Colour and depth of one moment; nothing of it is kept.
@@ -110,12 +111,9 @@ class FrameMaker:
             images["depth"] = frames.get_depth_frame()
         arrived = {kind: image for kind, image in images.items() if image}
         fresh = self._note(arrived)
-        if len(arrived) < len(images):
-            self._counts[INCOMPLETE] += 1
-            return None
-        if not fresh:
-            # librealsense pairs a late image with the last one of the other sensor.
-            self._counts[REPEATED] += 1
+        # librealsense pairs an image without a partner with the last one of the other sensor.
+        if len(arrived) < len(images) or not fresh:
+            self._counts[UNPAIRED] += 1
             return None
         if self._to_skip:
             self._to_skip -= 1
@@ -141,10 +139,15 @@ class FrameMaker:
         for block in self._filters:
             frames = block.process(frames).as_frameset()
         # A copy: librealsense stops delivering when its buffers are held.
-        return np.array(self._align.process(frames).get_depth_frame().get_data(), np.uint16)
+        depth = np.array(self._align.process(frames).get_depth_frame().get_data(), np.uint16)
+        if self._gain is None:
+            return depth
+        moved = np.clip(np.rint((depth + self._shift) * self._gain), 0, 65535)
+        return np.where(depth > 0, moved, 0).astype(np.uint16)
 
     def _header(self, color: Any, arrival_ns: int) -> Header:
-        stamp_ns = round(color.get_timestamp() * 1e6)
+        whole_ms, rest_ms = divmod(color.get_timestamp(), 1)
+        stamp_ns = int(whole_ms) * 10**6 + round(rest_ms * 1e6)
         if not self._live:
             arrival_ns = _recorded_arrival_ns(color) or stamp_ns
         if _domain(color) is Domain.HARDWARE:
@@ -166,6 +169,27 @@ class FrameMaker:
             self._base = number - self._sequence - 1
         self._sequence = number - self._base
         return self._sequence
+
+
+def _along_color_axis(
+    streams: dict[str, Any], camera: Camera, scale: float
+) -> tuple[NDArray[np.float32] | None, np.float32]:
+    """Return (H, W) gain and shift: (depth + shift) * gain is z of the colour camera, in units.
+
+    No gain where the two cameras look the same way from the same distance.
+
+    librealsense moves a depth value to the pixel it belongs to and leaves its value alone: the
+    distance along the axis of the depth camera, which is turned and shifted against the colour
+    camera. Of a point p = R q + t, the depth camera measures q_z = r3 . (p - t) with r3 the last
+    column of R; on the ray (x, y, 1) of a pixel, p_z = (q_z + r3 . t) / (r3 . (x, y, 1)).
+    """
+    pose = streams["depth"].get_extrinsics_to(streams["color"])
+    r3, t = np.array(pose.rotation[6:]), np.array(pose.translation)  # stored column by column
+    if np.array_equal(r3, (0, 0, 1)) and t[2] == 0:
+        return None, np.float32(0)
+    pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
+    rays = camera.deproject(pixels.astype(float), np.ones(pixels.shape[:2]))
+    return (1 / (rays @ r3)).astype(np.float32), np.float32(r3 @ t / scale)
 
 
 def _recorded_arrival_ns(frame: Any) -> int:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from mushpipe import Camera, RgbdFrame
 from mushpipe.core.libraries import import_realsense
@@ -48,7 +49,8 @@ class Rig:
         color: Intrinsics of the colour camera; depth has those given by ``depth``.
         color_format: Name of the colour images' pixel format.
         options: Settable options of the depth sensor, name -> (lowest, highest, default).
-        baseline: Extrinsics depth -> colour: translation along x in metres.
+        shift: Translation depth -> colour in metres.
+        turn: Rotation vector depth -> colour in radians.
     """
 
     def __init__(
@@ -57,7 +59,8 @@ class Rig:
         depth: Camera | None = DEPTH,
         color_format: str = "rgb8",
         options: dict[str, tuple[float, float, float]] | None = None,
-        baseline: float = 0.025,
+        shift: tuple[float, float, float] = (0.025, 0.0, 0.0),
+        turn: tuple[float, float, float] = (0.0, 0.0, 0.0),
         serial: str = SERIAL,
     ) -> None:
         self.color, self.depth = color, depth
@@ -74,7 +77,7 @@ class Rig:
                 sensor.add_option(getattr(rs.option, name), _range(*limits), True)
         self._add("color", color, self.bytes_per_pixel, getattr(rs.format, color_format))
         if depth:
-            profile.register_extrinsics_to(self.sensors["color"][1], _shift(baseline))
+            profile.register_extrinsics_to(self.sensors["color"][1], _pose(shift, turn))
         self.device.create_matcher(rs.matchers.dlr_c)
         self.context = Context()
         self.device.add_to(self.context)
@@ -198,9 +201,10 @@ def _intrinsics(camera: Camera) -> Any:
     return result
 
 
-def _shift(x: float) -> Any:
+def _pose(shift: tuple[float, ...], turn: tuple[float, ...]) -> Any:
     result = rs.extrinsics()
-    result.rotation, result.translation = [1, 0, 0, 0, 1, 0, 0, 0, 1], [x, 0, 0]
+    rotation = Rotation.from_rotvec(turn).as_matrix()
+    result.rotation, result.translation = rotation.T.ravel().tolist(), list(shift)
     return result
 
 
