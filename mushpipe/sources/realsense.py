@@ -28,6 +28,7 @@ from mushpipe.sources.realsense_link import (
 )
 
 logger = logging.getLogger("mushpipe")
+UNPLAYED = "colour images of the recording that were not played"
 TIMES_LOST = "times the camera was lost"
 _SIZE = r"^[1-9]\d{1,3}x[1-9]\d{1,3}$"
 # The names of librealsense's options for the depth sensor of an SR300.
@@ -166,6 +167,7 @@ class RealsenseSource(ReplaySource):
                 yield frames, time.time_ns()
                 continue
             if link.ended():
+                self._counts[UNPLAYED] += link.unplayed()
                 return
             quiet_s += POLL_MS / 1000
             link.check(quiet_s, self.patience_s)
@@ -207,9 +209,7 @@ class RealsenseSource(ReplaySource):
             name for name in ("preset", "serial", *_OPTIONS) if getattr(self, name) is not None
         ]
         if ignored:
-            logger.warning(
-                "a recording cannot be set any more: no effect of %s", ", ".join(ignored)
-            )
+            logger.warning("of no effect on a recording: %s", ", ".join(ignored))
         return FileLink(self._context(), path)
 
     def _open_camera(self) -> CameraLink:

@@ -8,11 +8,14 @@ from typing import Any, NamedTuple
 
 from mushpipe.core.errors import DeviceError, InputError
 from mushpipe.core.libraries import import_realsense
+from mushpipe.sources.realsense_bag import count_color_images
 from mushpipe.sources.realsense_device import find_device, info
 
 POLL_MS = 250
 # Framesets that may wait inside librealsense while one is aligned and copied.
 _QUEUE = 4
+# So many images at the two ends of a good recording may find no partner.
+_PARTNERLESS = 4
 
 
 class CameraLostError(Exception):
@@ -94,6 +97,10 @@ class CameraLink:
         """Return whether no more frames can come."""
         return False
 
+    def unplayed(self) -> int:
+        """Return 0: this is for recordings."""
+        return 0
+
     def stop(self) -> None:
         """Stop streaming; also after the camera was lost."""
         _stop(self._pipeline)
@@ -125,19 +132,29 @@ class FileLink:
         self._playback = self.profile.get_device().as_playback()
         # Else it plays at its own pace and drops what comes too late.
         self._playback.set_real_time(False)
-        self._position_ns = self._frames = 0
+        # Else the first image is lost where its sensor is not the one that is started first.
+        self._playback.pause()
+        try:
+            self._images = count_color_images(path)
+        except ValueError:  # librealsense could read it, so it is not for us to refuse
+            self._images = 0
+        self._played = 0
+        self._last_number: int | None = None
 
     def start(self) -> None:
         """Start playing."""
         self.profile = self._pipeline.start(self._config)
+        self._playback.resume()
 
     def wait(self) -> Any:
         """Return the next frameset, or None when none came for a quarter of a second."""
         arrived, frames = self._pipeline.try_wait_for_frames(POLL_MS)
         if not arrived:
             return None
-        self._frames += 1
-        self._position_ns = max(self._position_ns, self._playback.get_position())
+        color = frames.get_color_frame()
+        if color and color.get_frame_number() != self._last_number:
+            self._last_number = color.get_frame_number()
+            self._played += 1
         return frames
 
     def check(self, quiet_s: float, patience_s: float) -> None:
@@ -153,16 +170,16 @@ class FileLink:
         """
         if self._playback.current_status() != import_realsense().playback_status.stopped:
             return False
-        duration_s, position_s = (
-            self._playback.get_duration().total_seconds(),
-            self._position_ns / 1e9,
-        )
-        if duration_s - position_s > 5 * position_s / max(self._frames, 1):
+        if self.unplayed() > _PARTNERLESS:
             raise InputError(
-                f"{self.path} is damaged: it stops at {position_s:.2f} s of {duration_s:.2f} s; "
-                f"{self._frames} frames could be read"
+                f"{self.path} is damaged: {self._played} of its {self._images} colour images "
+                "could be read"
             )
         return True
+
+    def unplayed(self) -> int:
+        """Return how many of the colour images in the file did not come."""
+        return max(0, self._images - self._played)
 
     def stop(self) -> None:
         """Close the recording."""
