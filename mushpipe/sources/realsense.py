@@ -54,14 +54,20 @@ class RealsenseSource(ReplaySource):
     preset: str | int | None = Field(
         None, description="visual preset by the camera's name for it, short-range say, or number"
     )
-    laser_power: float | None = Field(None, ge=0, description="SR300: 0 to 16")
-    accuracy: int | None = Field(None, ge=0, description="SR300: 1 finest to 3 coarsest pattern")
-    motion_range: int | None = Field(
-        None, ge=0, description="SR300: 0 to 220, longer exposure for a longer range"
+    laser_power: float | None = Field(
+        None, ge=0, description="SR300: power of its projector, 0 (off) to 16"
     )
-    filter_option: int | None = Field(None, ge=0, description="SR300: 0 raw to 7 smoothest")
+    accuracy: int | None = Field(
+        None, ge=0, description="SR300: 0 to 3; more patterns per image are finer and slower"
+    )
+    motion_range: int | None = Field(
+        None, ge=0, description="SR300: 0 to 220; low for motion, high for range (slower)"
+    )
+    filter_option: int | None = Field(
+        None, ge=0, description="SR300: 0 to 7, the filter inside of the camera"
+    )
     confidence_threshold: int | None = Field(
-        None, ge=0, description="SR300: 0 to 15, less sure depth is dropped"
+        None, ge=0, description="SR300: 0 to 15; less sure depth becomes missing"
     )
     depth_options: dict[str, float] = Field(
         default_factory=dict, description="other options of the depth sensor, by librealsense name"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections import defaultdict
 from pathlib import Path
@@ -11,12 +12,12 @@ import pytest
 
 from mushpipe import Camera, RgbdFrame, Stage
 from mushpipe.core.plugins import load_registry
-from mushpipe.core.recording import RecordingReader, RecordingWriter
+from mushpipe.core.recording import MANIFEST, RecordingReader, RecordingWriter
 from mushpipe.core.report import RunReport
 from mushpipe.sources.mcap import McapSource
 from mushpipe.sources.synthetic import SyntheticSource
 from tests.core.lab import Lab, soon
-from tests.live.rig import SYSTEM, Rig, acquire
+from tests.live.rig import SERIAL, SYSTEM, Rig, acquire
 
 FRAMES = 4
 CAMERA = Camera(640, 480, 617.0, 617.0, 319.5, 239.5)
@@ -160,5 +161,7 @@ def test_live_mcap_and_bag_of_the_same_scene_give_the_same_picks(tmp_path, scene
     assert len(first["/mushpipe/pick"]) == FRAMES
     assert b'"id":[0,1' in first["/mushpipe/pick"][0][1]
     assert bag == first
+    manifest = RecordingReader(tmp_path / "live.mcap").index().metadata[MANIFEST]["json"]
+    assert json.loads(manifest)["device"]["serial_number"] == SERIAL
     del first["/camera/clock"]  # of the camera, not of a replay
     assert replay == first
