@@ -153,16 +153,18 @@ class RealsenseSource(ReplaySource):
         link = self._link
         maker = FrameMaker(self.filters, self.warm_up, self._counts)
         while link is not None:
-            maker.begin(link)
             try:
+                maker.begin(link)
                 for frames, arrival_ns in self._framesets(link):
                     frame = maker.make(frames, arrival_ns)
                     if frame is not None:
                         yield frame
                 return
             except CameraLostError as lost:
+                why = str(lost)
+            finally:
                 link.stop()
-                link = self._link = self._reconnect(str(lost))
+            link = self._link = self._reconnect(why)
 
     def _framesets(self, link: Link) -> Iterator[tuple[Any, int]]:
         quiet_s = 0.0
