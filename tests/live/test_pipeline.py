@@ -78,10 +78,11 @@ def test_a_recorder_on_a_slow_disk_says_what_it_lost_and_holds_all_else(
 ):
     """The disk stalls on the first frame: what the queues cannot hold is dropped and counted."""
     rig, n = Rig(), 12
-    release = threading.Event()
+    entered, release = threading.Event(), threading.Event()
     write = RecordingWriter.frame
 
     def stalled(self, frame, quality=None):
+        entered.set()
         soon(release)
         write(self, frame, quality)
 
@@ -89,6 +90,8 @@ def test_a_recorder_on_a_slow_disk_says_what_it_lost_and_holds_all_else(
         acquire(rig.started)
         for i in range(n):
             rig.feed(i)
+            if i == 0:
+                soon(entered)
             acquire(rig.taken)
         release.set()
 
