@@ -111,11 +111,13 @@ def test_other_colour_formats(tmp_path, name):
 
 def damaged(bag: Path, kind: str) -> bytes:
     data = bag.read_bytes()
+    # Within the images of a chunk in the middle; the records around it stay whole.
+    at = data.index(b"op=\x05", len(data) // 2) + 200
     return {
         "empty": b"",
         "foreign": b"not a recording at all" * 100,
         "cut": data[: len(data) * 6 // 10],
-        "overwritten": data[: len(data) // 2] + bytes(2000) + data[len(data) // 2 + 2000 :],
+        "overwritten": data[:at] + bytes(1000) + data[at + 1000 :],
     }[kind]
 
 
