@@ -111,14 +111,18 @@ def _entries(document: Document) -> dict[Kind, list[tuple[Location, dict[str, An
 
 def _replace_source(document: Document, source: str, registry: Registry) -> None:
     is_name = ("source", source) in registry.entries and not Path(source).exists()
-    given = {"use": source} if is_name else {"use": "mcap", "path": source}
+    given = {"use": "mcap", "path": source}
+    if is_name:
+        given = {"use": source}
+    elif source.endswith(".bag"):
+        given = {"use": "realsense", "file": source}
     old = document.data.get("source")
     if isinstance(old, dict) and old.get("use") == given["use"]:
         given = {**old, **given}
     document.data["source"] = given
     label = f"--source {source}"
     document.overrides[("source",)] = label
-    for key in ("use", "path"):
+    for key in ("use", "path", "file"):
         if key in given:
             document.overrides[("source", key)] = label
 

@@ -70,6 +70,7 @@ class RunReport:
     dropped: int = 0
     failed: int = 0
     source: dict[str, int] = field(default_factory=dict)
+    device: dict[str, Any] = field(default_factory=dict)
     sinks: dict[str, SinkReport] = field(default_factory=dict)
     durations: dict[str, Durations] = field(default_factory=dict)
     elapsed_s: float = 0.0
@@ -109,6 +110,7 @@ class RunReport:
                 "balanced": self.balanced(),
             },
             "source": self.source,
+            **({"device": self.device} if self.device else {}),
             "sinks": {name: vars(sink) for name, sink in self.sinks.items()},
             "stages": {name: d.summary() for name, d in self.durations.items()},
             "elapsed_s": round(self.elapsed_s, 3),

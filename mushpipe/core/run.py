@@ -79,6 +79,7 @@ class _Runner:
             self._spare_the_recording(source, info)
         with ExitStack() as stack:
             stack.enter_context(_opened(self.plan.source, _opener(self.plan.source)))
+            info = self._with_device(source, info)
             for node in self.plan.stages:
                 stack.enter_context(_opened(node, _opener(node)))
             for node in self.plan.sinks:
@@ -91,6 +92,12 @@ class _Runner:
             finally:
                 self._wind_up(reader, source, threads)
             self._finish(threads)
+
+    def _with_device(self, source: Source, info: RunInfo) -> RunInfo:
+        with _named(self.plan.source):
+            self.report.device = source.describe()
+        device = {"device": self.report.device} if self.report.device else {}
+        return replace(info, manifest={**info.manifest, **device})
 
     def _spare_the_recording(self, source: Source, info: RunInfo) -> None:
         """Raise UsageError where a sink would write over the recording that is played."""
@@ -151,6 +158,7 @@ class _Runner:
         """Stop the threads, let the sinks finish what they were handed, and settle the counts."""
         reader.stop.set()
         reader.box.close()
+        source.interrupt()
         for thread in threads:
             thread.box.close()
         for edge in (reader, *threads):

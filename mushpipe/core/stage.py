@@ -76,9 +76,12 @@ class Stage(Plugin):
 class Source(Plugin):
     """Where frames come from."""
 
-    live: ClassVar[bool] = False
-
     max_frames: int | None = Field(None, ge=1, description="stop after so many frames")
+
+    @property
+    def live(self) -> bool:
+        """Whether frames come when they come, so that a late one is dropped, never waited for."""
+        return False
 
     def name(self) -> str:
         """Return a short name for file names."""
@@ -91,9 +94,16 @@ class Source(Plugin):
     def open(self) -> None:
         """Check that there is something to read, before any sink creates a file."""
 
+    def describe(self) -> dict[str, Any]:
+        """Return what an opened device says about itself, as plain data for the manifest."""
+        return {}
+
     def frames(self) -> Iterator[RgbdFrame]:
         """Yield frames; raise InputError after the last good one where the input is damaged."""
         raise NotImplementedError
+
+    def interrupt(self) -> None:
+        """Give up waiting for a frame; called from another thread when a run ends early."""
 
     def counts(self) -> dict[str, int]:
         """Return what was lost or repaired on the way in, by a name people understand."""
