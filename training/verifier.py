@@ -171,7 +171,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cache", type=Path, default=Path("out/scenes"), help="rendered frames")
     parser.add_argument("--out", type=Path, default=Path("mushpipe/stages/verifier.yaml"))
-    parser.add_argument("--rounds", type=int, default=4)
+    parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--ridge", type=float, default=1e-3)
     arguments = parser.parse_args()
     train(arguments.cache, arguments.out, arguments.rounds, arguments.ridge)
