@@ -158,13 +158,13 @@ def first_fits(
         ray = ray_at(image[1], focal, circles[i, 0], circles[i, 1])
         start(caps[i], points[i], n, upright[0], ray, middle, size)
         known = (points[i][:, :n], edges[i][:, :m], around[i], outline[i][:, :0])
-        if not refine(caps[i], known, upright, noise, focal, size, (0, 2), work):
+        if not refine(caps[i], known, upright, noise, focal, size, 0, 2, work):
             continue
         lines = sample_outline(
             gray, image[1], image[2], rank[i], caps[i], circles[i], focal, outline[i]
         )
         known = (points[i][:, :n], edges[i][:, :m], around[i], outline[i][:, :lines])
-        if not refine(caps[i], known, upright, noise, focal, size, (2, 4), work):
+        if not refine(caps[i], known, upright, noise, focal, size, 2, 4, work):
             continue
         if uncertainty(caps[i], known, upright, noise, focal, covariances[i], work) >= 0.0:
             counts[i, 0], counts[i, 1], counts[i, 2], counts[i, 4] = n, m, lines, size
@@ -193,7 +193,7 @@ def second_fits(
         n, m, lines = int(counts[i, 0]), int(counts[i, 1]), int(counts[i, 2])
         known = (points[i][:, :n], edges[i][:, :m], around[i], outline[i][:, :lines])
         own = (upright[0], spreads[i])
-        refine(caps[i], known, own, noise, focal, counts[i, 4], (4, 5), work)
+        refine(caps[i], known, own, noise, focal, counts[i, 4], 4, 5, work)
         counts[i, 3] = uncertainty(caps[i], known, own, noise, focal, covariances[i], work)
         ray = ray_at(image[1], focal, circles[i, 0], circles[i, 1])
         locate(caps[i], ray, covariances[i], noise.circle_px / focal, surfaces[i])

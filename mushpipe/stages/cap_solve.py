@@ -226,12 +226,13 @@ def refine(
     noise: Any,
     focal: float,
     size: float,
-    steps: tuple[int, int],
+    first: int,
+    last: int,
     work: Any,
 ) -> bool:
-    """Take Gauss-Newton steps number steps[0] to steps[1] - 1; False where one has no solution."""
+    """Take Gauss-Newton steps number first to last - 1; False where one has no solution."""
     normal, gradient = work[0]
-    for k in range(steps[0], steps[1]):
+    for k in range(first, last):
         m = min(k, len(DEPTH_CUTS) - 1)
         build(cap, data, upright, noise, focal, (DEPTH_CUTS[m], EDGE_CUTS[m]), work)
         if not cholesky(normal):

@@ -23,13 +23,19 @@ def plane(points: Floats, count: int, ray: Vector, out: Floats) -> bool:
     for j in range(count):
         far = points[3, j]
         row = (far * (points[0, j] - ray[0]), far * (points[1, j] - ray[1]), 1.0)
-        for a in range(3):
-            right[a] += row[a] * far * points[2, j]
-            for b in range(3):
-                matrix[a, b] += row[a] * row[b]
-    if not abs(np.linalg.det(matrix)) > 1e-16:
+        for i in range(3):
+            right[i] += row[i] * far * points[2, j]
+            for k in range(3):
+                matrix[i, k] += row[i] * row[k]
+    # Cramer's rule; numpy's solvers take seconds to compile into a kernel
+    a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
+    d, e, f = matrix[1, 1], matrix[1, 2], matrix[2, 2]
+    p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
+    det = a * p + b * q + c * r
+    if not abs(det) > 1e-16:
         return False
-    x, y, _ = np.linalg.solve(matrix, right)
+    x = (p * right[0] + q * right[1] + r * right[2]) / det
+    y = (q * right[0] + (a * f - c * c) * right[1] + (b * c - a * e) * right[2]) / det
     norm = np.sqrt(x * x + y * y + 1.0)
     out[0], out[1], out[2] = x / norm, y / norm, -1.0 / norm
     return True
