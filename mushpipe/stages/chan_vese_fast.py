@@ -5,8 +5,8 @@ sqrt(2 pi) / sigma * sum u (1 - G_sigma * u); linearised, an iteration is a blur
 
     u <- 1 where (c1 - c2)(2 I - c1 - c2) - mu sqrt(2 pi) / sigma (1 - 2 G_sigma * u) > 0
 
-The sweeps that follow descend the exact discrete energy on the pixels of the contour (ICM, Besag
-1986), which convolution with its finite kernel cannot reach.
+The sweeps that follow, on every level, descend the exact discrete energy on the pixels of the
+contour (ICM, Besag 1986), which convolution with its finite kernel cannot reach.
 """
 
 from __future__ import annotations
@@ -176,23 +176,21 @@ def solve_fast(
         depth: Levels of the pyramid, the full resolution among them.
         iterations: Most ICTM iterations at full resolution, doubled per level; fewer where nothing
             moves any more.
-        sweeps: Most sweeps of descent on the contour, at full resolution.
+        sweeps: Most sweeps of descent on the contour at full resolution, four times more per level.
     """
     planes = np.ascontiguousarray(np.moveaxis(image, -1, 0) if image.ndim == 3 else image[None])
-    u = _pyramid(planes, initial.astype(np.float32), mu, levels, depth, iterations)
-    regions = _Regions(planes, u, levels)
-    for _ in range(sweeps):
-        if regions.one_sided:
-            break
-        plane, gain, offset = regions.force()
-        if not icm_sweep(plane, u, gain, offset, mu):
-            break
-        regions.update(u)
+    u = _pyramid(planes, initial.astype(np.float32), mu, levels, depth, iterations, sweeps)
     return u > 0
 
 
 def _pyramid(
-    planes: Planes, u: Plane, mu: float, levels: Levels | None, depth: int, iterations: int
+    planes: Planes,
+    u: Plane,
+    mu: float,
+    levels: Levels | None,
+    depth: int,
+    iterations: int,
+    sweeps: int,
 ) -> Plane:
     """Solve at half resolution first, with mu / 2: the length halves while the area quarters."""
     height, width = u.shape
@@ -200,9 +198,10 @@ def _pyramid(
         half = (width // 2, height // 2)
         small = np.stack([cv2.resize(p, half, interpolation=cv2.INTER_AREA) for p in planes])
         start = cv2.resize(u, half, interpolation=cv2.INTER_AREA).round()
-        solved = _pyramid(small, start, mu / 2, levels, depth - 1, 2 * iterations)
+        solved = _pyramid(small, start, mu / 2, levels, depth - 1, 2 * iterations, 4 * sweeps)
         u = cv2.resize(solved, (width, height)).round()
-    return _ictm(planes, u, mu, levels, iterations)
+    u = _ictm(planes, u, mu, levels, iterations)
+    return _descend(planes, u, mu, levels, sweeps)
 
 
 def _ictm(planes: Planes, u: Plane, mu: float, levels: Levels | None, iterations: int) -> Plane:
@@ -215,6 +214,18 @@ def _ictm(planes: Planes, u: Plane, mu: float, levels: Levels | None, iterations
         changed = ictm_sweep(plane, u, other, _TAPS, gain, offset, pull)
         u, other = other, u
         if not changed:
+            break
+        regions.update(u)
+    return u
+
+
+def _descend(planes: Planes, u: Plane, mu: float, levels: Levels | None, sweeps: int) -> Plane:
+    regions = _Regions(planes, u, levels)
+    for _ in range(sweeps):
+        if regions.one_sided:
+            break
+        plane, gain, offset = regions.force()
+        if not icm_sweep(plane, u, gain, offset, mu):
             break
         regions.update(u)
     return u

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
@@ -25,6 +26,9 @@ class Height(Stage):
     min_mm: float = Field(8, gt=0, description="height at which a pixel is more cap than bed, mm")
     max_mm: float = Field(150, gt=0, description="what rises higher is no mushroom, mm")
     mu: float = Field(0.05, gt=0, description="weight of the contour's length, on height in 0..1")
+    smallest_px: float = Field(
+        10, ge=0, description="diameter of the smallest piece that is kept: clods and pins are less"
+    )
     relief: bool = Field(True, description="follow the relief of the soil; false for a table")
 
     def open(self) -> None:
@@ -42,7 +46,16 @@ class Height(Stage):
         initial = scaled > 0.5
         if not initial.any():
             return Mask(initial, initial)
-        return Mask(solve_fast(scaled, initial, self.mu, levels=(1.0, 0.0)), initial)
+        region = solve_fast(scaled, initial, self.mu, levels=(1.0, 0.0))
+        return Mask(without_crumbs(region, self.smallest_px), initial)
+
+
+def without_crumbs(region: NDArray[np.bool_], diameter: float) -> NDArray[np.bool_]:
+    """Return a region without the pieces of a smaller area than a disc of the diameter (px)."""
+    count, label, stats, _ = cv2.connectedComponentsWithStats(region.view(np.uint8))
+    keep = stats[:count, cv2.CC_STAT_AREA] >= np.pi / 4 * diameter**2
+    keep[0] = False
+    return np.asarray(keep[label])
 
 
 def height_map(frame: RgbdFrame, relief: bool = True) -> Plane | None:

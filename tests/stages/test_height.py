@@ -5,7 +5,13 @@ import pytest
 
 from mushpipe import Camera, RgbdFrame
 from mushpipe.stages.bed import bed_depth, far_cells
-from mushpipe.stages.height import Height, filled, height_image, height_map
+from mushpipe.stages.height import (
+    Height,
+    filled,
+    height_image,
+    height_map,
+    without_crumbs,
+)
 from tests.stages.frames import iou, simulated, truth_of
 from tests.stages.scenes import HEADER
 
@@ -52,7 +58,7 @@ def test_spheres_on_a_tilted_plane(tilt: float, relief: bool) -> None:
 
 
 def test_spheres_on_a_bumpy_plane_need_the_relief() -> None:
-    bumps = 0.006 * np.sin(U / 45) * np.cos(V / 40)
+    bumps = 0.008 * np.sin(U / 45) * np.cos(V / 40)
     depth, truth = scene(plane(5) + bumps)
     plain, bent = (
         iou(Height(relief=relief).process(frame_of(depth)).foreground, truth)
@@ -155,3 +161,13 @@ def test_filling_reaches_no_farther_than_a_shadow() -> None:
 def test_brown_caps_of_the_simulator_are_found(seed: int) -> None:
     frame = simulated(seed, width=640, height=480, count=60, cap_color="brown")
     assert iou(Height().process(frame).foreground, truth_of(frame)) > 0.85
+
+
+def test_pieces_smaller_than_a_cap_are_dropped() -> None:
+    region = np.zeros((60, 80), bool)
+    region[10:19, 10:19] = True  # 81 px, a disc of 10 px has 79
+    region[30:38, 40:49] = True  # 72 px
+    kept = without_crumbs(region, 10)
+    assert kept[14, 14]
+    assert kept.sum() == 81
+    assert (without_crumbs(region, 0) == region).all()
