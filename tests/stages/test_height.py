@@ -58,7 +58,7 @@ def test_spheres_on_a_tilted_plane(tilt: float, relief: bool) -> None:
 
 
 def test_spheres_on_a_bumpy_plane_need_the_relief() -> None:
-    bumps = 0.008 * np.sin(U / 45) * np.cos(V / 40)
+    bumps = 0.007 * np.sin(U / 45) * np.cos(V / 40)
     depth, truth = scene(plane(5) + bumps)
     plain, bent = (
         iou(Height(relief=relief).process(frame_of(depth)).foreground, truth)
