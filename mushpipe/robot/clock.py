@@ -27,11 +27,15 @@ class Clock:
 
 @dataclass
 class _Span:
-    """A stretch of monotonic time during which wall minus monotonic was constant."""
+    """A stretch of monotonic time during which wall minus monotonic was constant.
+
+    It was seen from ``sure`` on; between ``begin``, the look before, and then it may have been any.
+    """
 
     begin: float
     end: float
     offset: float
+    sure: float
 
 
 class Placer:
@@ -44,7 +48,7 @@ class Placer:
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         now, offset = self._read()
-        self._spans = deque([_Span(now - MEMORY_S, now, offset)])
+        self._spans = deque([_Span(now - MEMORY_S, now, offset, now - MEMORY_S)])
 
     def _read(self) -> tuple[float, float]:
         now = self._clock.monotonic()
@@ -56,7 +60,7 @@ class Placer:
         last = self._spans[-1]
         if abs(offset - last.offset) > STEP_S:
             # The jump came at an unknown moment since the last look: both offsets may hold there.
-            self._spans.append(_Span(last.end, now, offset))
+            self._spans.append(_Span(last.end, now, offset, now))
         self._spans[-1].end = last.end = now
         while self._spans[0].end < now - MEMORY_S:
             self._spans.popleft()
@@ -66,8 +70,10 @@ class Placer:
     def place(self, stamp_ns: int) -> float | None:
         """Return the monotonic time of a stamp; None for the future and the far past."""
         now = self.sample()
+        # A moment between two looks that disagree counts as the earlier of them: the wall clock
+        # may have jumped more than once in between.
         found = [
-            time_s
+            time_s if time_s > span.sure + TOLERANCE_S else min(time_s, span.begin)
             for span in self._spans
             if span.begin - TOLERANCE_S
             <= (time_s := stamp_ns / 1e9 - span.offset)

@@ -203,3 +203,15 @@ def test_a_live_source_is_live_even_where_recordings_are_permitted() -> None:
     with Peer(port(sink)) as peer:
         assert not peer.greet()["replay"]
     sink.close()
+
+
+def test_two_jumps_between_two_looks_make_nothing_younger() -> None:
+    clock = FakeClock()
+    placer = Placer(clock)
+    moment = clock.now
+    clock.offset_s += 1.0
+    stamp = clock.wall_ns()
+    clock.now += 0.375
+    clock.offset_s -= 0.375
+    placed = placer.place(stamp)
+    assert placed is None or placed <= moment
