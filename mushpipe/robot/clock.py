@@ -29,13 +29,24 @@ class Clock:
 class _Span:
     """A stretch of monotonic time during which wall minus monotonic was constant.
 
-    It was seen from ``sure`` on; between ``begin``, the look before, and then it may have been any.
+    It was seen from ``sure`` to ``until``. Between those and ``begin`` and ``end``, the looks
+    before and after, the wall clock jumped, who knows how often.
     """
 
     begin: float
     end: float
     offset: float
     sure: float
+    until: float
+
+    def place(self, stamp_s: float) -> float | None:
+        """Return when the wall clock may have shown a stamp: the earliest moment that fits."""
+        time_s = stamp_s - self.offset
+        if not self.begin - TOLERANCE_S <= time_s <= self.end + TOLERANCE_S:
+            return None
+        if time_s <= self.sure + TOLERANCE_S:
+            return min(time_s, self.begin)
+        return min(time_s, self.until)
 
 
 class Placer:
@@ -48,7 +59,7 @@ class Placer:
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         now, offset = self._read()
-        self._spans = deque([_Span(now - MEMORY_S, now, offset, now - MEMORY_S)])
+        self._spans = deque([_Span(now - MEMORY_S, now, offset, now - MEMORY_S, now)])
 
     def _read(self) -> tuple[float, float]:
         now = self._clock.monotonic()
@@ -58,10 +69,12 @@ class Placer:
         """Look at both clocks; return the monotonic time. To be called a few times a second."""
         now, offset = self._read()
         last = self._spans[-1]
+        last.end = now
         if abs(offset - last.offset) > STEP_S:
             # The jump came at an unknown moment since the last look: both offsets may hold there.
-            self._spans.append(_Span(last.end, now, offset, now))
-        self._spans[-1].end = last.end = now
+            self._spans.append(_Span(last.until, now, offset, now, now))
+        else:
+            last.until = now
         while self._spans[0].end < now - MEMORY_S:
             self._spans.popleft()
         self._spans[0].begin = max(self._spans[0].begin, now - MEMORY_S)
@@ -70,13 +83,6 @@ class Placer:
     def place(self, stamp_ns: int) -> float | None:
         """Return the monotonic time of a stamp; None for the future and the far past."""
         now = self.sample()
-        # A moment between two looks that disagree counts as the earlier of them: the wall clock
-        # may have jumped more than once in between.
-        found = [
-            time_s if time_s > span.sure + TOLERANCE_S else min(time_s, span.begin)
-            for span in self._spans
-            if span.begin - TOLERANCE_S
-            <= (time_s := stamp_ns / 1e9 - span.offset)
-            <= span.end + TOLERANCE_S
-        ]
+        placed = [span.place(stamp_ns / 1e9) for span in self._spans]
+        found = [time_s for time_s in placed if time_s is not None]
         return min(now, *found) if found else None
