@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Iterator
@@ -26,6 +27,17 @@ def failure(node: Node, sequence: int | None, error: BaseException) -> StageErro
     text = str(error) if known else f"{type(error).__name__}: {error}"
     code = error.exit_code if isinstance(error, MushpipeError) else 1
     return StageError(f"{node.kind} '{node.name}' ({node.use}) failed{at}: {text}", code)
+
+
+def limited(frames: Iterator[RgbdFrame], source: Source) -> Iterator[RgbdFrame]:
+    """Yield frames up to the source's ``max_frames`` and ``max_seconds``."""
+    end_ns: float = math.inf
+    for frame in islice(frames, source.max_frames):
+        if source.max_seconds is not None and end_ns == math.inf:
+            end_ns = frame.header.stamp_ns + source.max_seconds * 1e9
+        if frame.header.stamp_ns >= end_ns:
+            return
+        yield frame
 
 
 def paced(frames: Iterator[RgbdFrame], speed: float, stop: threading.Event) -> Iterator[RgbdFrame]:
@@ -68,7 +80,7 @@ class SourceThread(threading.Thread):
         speed = self.source.speed if isinstance(self.source, ReplaySource) else 0.0
         frames = self.source.frames()
         try:
-            for frame in islice(paced(frames, speed, self.stop), self.source.max_frames):
+            for frame in limited(paced(frames, speed, self.stop), self.source):
                 if self.stop.is_set() or not self.box.put(frame):
                     break
         finally:
@@ -105,7 +117,8 @@ class SinkThread(threading.Thread):
                 in_a_row += 1
                 if in_a_row >= self.tolerant:
                     self.error = failure(self.node, frame.header.sequence, error)
-                    self.failed_frame = frame
+                    if not isinstance(error, MushpipeError):  # not a full disk, for instance
+                        self.failed_frame = frame
                     self.box.close()
                     return
 

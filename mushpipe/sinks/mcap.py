@@ -5,14 +5,17 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Mapping
+from glob import escape
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from pydantic import Field, PrivateAttr
+from pydantic import ByteSize, Field, PrivateAttr
 
 from mushpipe import GraphPath, RunInfo, Sink, Trace
 from mushpipe.core import wire
-from mushpipe.core.recording import MANIFEST, SUMMARY, RecordingWriter
+from mushpipe.core.recorder import RecordingWriter
+from mushpipe.core.recording import LIVE, MANIFEST, SUMMARY
+from mushpipe.core.stage import STDIO
 
 logger = logging.getLogger("mushpipe")
 
@@ -31,24 +34,48 @@ class McapSink(Sink):
         None, ge=1, le=100, description="store colour as JPEG of this quality; lossless if not set"
     )
     timing: bool = Field(True, description="record the time each stage took")
+    split_size: ByteSize | None = Field(
+        None, ge=1, description="begin a new file when one has this size, 2GB say; each is complete"
+    )
 
+    _run: RunInfo | None = PrivateAttr(None)
+    _part: int = PrivateAttr(0)
     _writer: RecordingWriter | None = PrivateAttr(None)
     _unknown: set[type] = PrivateAttr(default_factory=set)
 
     def files(self, run: RunInfo) -> tuple[Path, ...]:
-        """Return the file it writes."""
-        return (run.path(self.path),)
+        """Return the files it writes; of a split recording the first one and all there are."""
+        if self.path == STDIO:
+            return ()
+        path = run.path(self.path)
+        if self.split_size is None:
+            return (path,)
+        parts = path.parent.glob(f"{escape(path.stem)}_[0-9]*{path.suffix}")
+        return tuple(sorted({part(path, 0), *parts}))
 
     def open(self, run: RunInfo) -> None:
         """Create the file and write the manifest."""
-        manifest = {"json": json.dumps(dict(run.manifest))}
-        self._writer = RecordingWriter(run.path(self.path), {MANIFEST: manifest})
+        self._run, self._part = run, 0
+        self._writer = self._begin(run)
+
+    def _begin(self, run: RunInfo) -> RecordingWriter:
+        path = self.path if self.path == STDIO else run.path(self.path)
+        if self.split_size is not None:
+            path = part(path, self._part)
+        metadata = {MANIFEST: {"json": json.dumps(dict(run.manifest))}}
+        if path == STDIO and run.live:
+            metadata = {LIVE: {}, **metadata}
+        return RecordingWriter(path, metadata)
 
     def consume(self, trace: Trace) -> None:
         """Write one frame and its results."""
         writer, frame = self._writer, trace.frame
-        if writer is None:
+        if writer is None or self._run is None:
             raise RuntimeError("the sink is not open")
+        if self.split_size is not None and writer.size >= self.split_size:
+            writer.close()
+            self._part += 1
+            writer = self._writer = self._begin(self._run)
         if self.frames:
             writer.frame(frame, self.jpeg_quality)
         for stage in trace.durations_ns:
@@ -81,3 +108,8 @@ class McapSink(Sink):
         if self._writer is not None:
             self._writer.close()
             self._writer = None
+
+
+def part(path: Path, number: int) -> Path:
+    """Return the name of a part of a split recording: ``row-7_000.mcap`` is the first."""
+    return path.with_name(f"{path.stem}_{number:03d}{path.suffix}")

@@ -147,7 +147,8 @@ def test_the_resolved_graph_writes_out_inputs_and_delivery(lab: Lab):
     graph = build_manifest(plan)["graph"]
     assert graph["stages"]["a"]["inputs"] == {"frame": "source"}
     assert graph["sinks"]["out"]["delivery"] == "every"
-    assert graph["source"] == {"use": "frames", "max_frames": None, "speed": 0.0, "count": 3}
+    limits = {"max_frames": None, "max_seconds": None}
+    assert graph["source"] == {"use": "frames", **limits, "speed": 0.0, "count": 3}
 
 
 def test_the_manifest_stands_beside_the_first_result(lab: Lab, graph: str):

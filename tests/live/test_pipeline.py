@@ -12,7 +12,8 @@ import pytest
 
 from mushpipe import Camera, Picks, RgbdFrame, Stage
 from mushpipe.core.plugins import load_registry
-from mushpipe.core.recording import MANIFEST, RecordingReader, RecordingWriter
+from mushpipe.core.recorder import RecordingWriter
+from mushpipe.core.recording import MANIFEST, RecordingReader
 from mushpipe.core.report import RunReport
 from mushpipe.core.wire import decode_table
 from mushpipe.sources.mcap import McapSource
