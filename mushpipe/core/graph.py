@@ -112,7 +112,9 @@ def _entries(document: Document) -> dict[Kind, list[tuple[Location, dict[str, An
 def _replace_source(document: Document, source: str, registry: Registry) -> None:
     is_name = ("source", source) in registry.entries and not Path(source).exists()
     given = {"use": "mcap", "path": source}
-    if is_name:
+    if source == "-":
+        given = {"use": "stream"}
+    elif is_name or ".py:" in source:
         given = {"use": source}
     elif source.endswith(".bag"):
         given = {"use": "realsense", "file": source}

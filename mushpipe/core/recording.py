@@ -22,7 +22,7 @@ from zstandard import ZstdError
 from mushpipe.core.errors import InputError, UsageError
 
 # What mcap's reader raises on bytes that are not what they claim to be.
-_GARBAGE = (
+GARBAGE = (
     *(McapError, ValueError, struct.error, ZstdError, RuntimeError, MemoryError, TypeError),
     *(OverflowError, LookupError, OSError),
 )
@@ -31,8 +31,6 @@ _FOOTER = struct.Struct("<BQQQI")
 MANIFEST = "mushpipe.manifest"
 SUMMARY = "mushpipe.summary"
 GRAPH = "mushpipe.graph"
-LIVE = "mushpipe.live"
-"""Metadata at the head of a stream whose frames come from a camera now."""
 
 
 class Raw(NamedTuple):
@@ -136,7 +134,7 @@ class RecordingReader:
                         yield from self._unpack(record)
             except InvalidMagic:
                 self._note("its last bytes are missing")
-            except _GARBAGE:
+            except GARBAGE:
                 self._note("it breaks off: the recorder did not close it, or bytes are missing")
 
     def _unpack(self, chunk: Chunk) -> list[McapRecord]:
@@ -144,7 +142,7 @@ class RecordingReader:
             if chunk.uncompressed_size > 2**32:
                 raise ValueError("implausible size")
             records = breakup_chunk(chunk, validate_crc=True)
-        except _GARBAGE as error:
+        except GARBAGE as error:
             self._note(f"a chunk is corrupt ({error})")
             return []
         # Only messages move, and all to the end: a channel is always known before its messages.
@@ -161,7 +159,7 @@ class RecordingReader:
         if self._index is None:
             try:
                 self._index = self._index_from_summary()
-            except _GARBAGE:
+            except GARBAGE:
                 self._index = self._index_by_scan()
         return self._index
 

@@ -63,8 +63,7 @@ class _Runner:
         self.progress = progress
         self.capsules = capsules
         self.report = RunReport(durations={node.name: Durations() for node in plan.stages})
-        on_error = plan.on_error or ("fail" if plan.replay() else "skip")
-        self.tolerance = plan.max_failures if on_error == "skip" else 1
+        self.tolerance = 1
         self.started = time.monotonic()
         self.saved: set[str] = set()  # nodes with a failure capsule
 
@@ -72,14 +71,10 @@ class _Runner:
         source = self.plan.source.plugin
         if not isinstance(source, Source):
             raise TypeError("the plan's source is not a Source")
-        reader = SourceThread(self.plan.source, source, threading.Event())
-        with _named(self.plan.source):
-            manifest = build_manifest(self.plan)
-            info = RunInfo(source.name(), manifest, source.live, lambda: reader.box.accepted)
-            self._spare_the_recording(source, info)
         with ExitStack() as stack:
             stack.enter_context(_opened(self.plan.source, _opener(self.plan.source)))
-            info = self._with_device(source, info)
+            reader = SourceThread(self.plan.source, source, threading.Event())
+            info = self._begin(source, reader)
             for node in self.plan.stages:
                 stack.enter_context(_opened(node, _opener(node)))
             for node in self.plan.sinks:
@@ -93,11 +88,18 @@ class _Runner:
                 self._wind_up(reader, source, threads)
             self._finish(threads)
 
-    def _with_device(self, source: Source, info: RunInfo) -> RunInfo:
+    def _begin(self, source: Source, reader: SourceThread) -> RunInfo:
+        """Return what the sinks are told, now that the source is open."""
+        on_error = self.plan.on_error or ("fail" if self.plan.replay() else "skip")
+        self.tolerance = self.plan.max_failures if on_error == "skip" else 1
         with _named(self.plan.source):
+            manifest = build_manifest(self.plan)
             self.report.device = source.describe()
-        device = {"device": self.report.device} if self.report.device else {}
-        return replace(info, manifest={**info.manifest, **device})
+            if self.report.device:
+                manifest["device"] = self.report.device
+            info = RunInfo(source.name(), manifest, source.live, lambda: reader.box.accepted)
+            self._spare_the_recording(source, info)
+        return info
 
     def _spare_the_recording(self, source: Source, info: RunInfo) -> None:
         """Raise UsageError where a sink would write over the recording that is played."""

@@ -89,7 +89,10 @@ class Source(Plugin):
 
     @property
     def live(self) -> bool:
-        """Whether frames come when they come, so that a late one is dropped, never waited for."""
+        """Whether frames come when they come, so that a late one is dropped, never waited for.
+
+        Asked for when the source is open.
+        """
         return False
 
     def name(self) -> str:

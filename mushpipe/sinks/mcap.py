@@ -14,7 +14,7 @@ from pydantic import ByteSize, Field, PrivateAttr
 from mushpipe import GraphPath, RunInfo, Sink, Trace
 from mushpipe.core import wire
 from mushpipe.core.recorder import RecordingWriter
-from mushpipe.core.recording import LIVE, MANIFEST, SUMMARY
+from mushpipe.core.recording import MANIFEST, SUMMARY
 from mushpipe.core.stage import STDIO
 
 logger = logging.getLogger("mushpipe")
@@ -60,19 +60,19 @@ class McapSink(Sink):
 
     def _begin(self, run: RunInfo) -> RecordingWriter:
         path = self.path if self.path == STDIO else run.path(self.path)
-        if self.split_size is not None:
+        if self.split_size is not None and path != STDIO:
             path = part(path, self._part)
-        metadata = {MANIFEST: {"json": json.dumps(dict(run.manifest))}}
+        manifest = {"json": json.dumps(dict(run.manifest))}
         if path == STDIO and run.live:
-            metadata = {LIVE: {}, **metadata}
-        return RecordingWriter(path, metadata)
+            manifest["live"] = "true"
+        return RecordingWriter(path, {MANIFEST: manifest})
 
     def consume(self, trace: Trace) -> None:
         """Write one frame and its results."""
         writer, frame = self._writer, trace.frame
         if writer is None or self._run is None:
             raise RuntimeError("the sink is not open")
-        if self.split_size is not None and writer.size >= self.split_size:
+        if self.split_size is not None and writer.size >= self.split_size and self.path != STDIO:
             writer.close()
             self._part += 1
             writer = self._writer = self._begin(self._run)
