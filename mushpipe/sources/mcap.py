@@ -16,7 +16,7 @@ from mushpipe.core.geometry import Camera
 from mushpipe.core.recording import GRAPH, MANIFEST, Index, RecordingReader
 from mushpipe.core.stage import GraphPath, ReplaySource
 from mushpipe.core.types import RgbdFrame
-from mushpipe.sources.playing import Player, RecordedSource
+from mushpipe.sources.playing import NO_DEPTH, Player, RecordedSource
 from mushpipe.sources.topics import choose_topics
 
 logger = logging.getLogger("mushpipe")
@@ -76,6 +76,8 @@ class McapSource(RecordedSource, ReplaySource):
         beside = _beside(index) if numbered else set()
         if not self.use_depth:
             topics = replace(topics, depth=None)
+        if topics.depth is None:
+            logger.warning(NO_DEPTH, self.path.name)
         player = Player(self, str(self.path), topics, beside, numbered, self._counts)
         yield from self._passes(player, reader, index)
 

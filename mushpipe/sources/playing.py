@@ -94,8 +94,6 @@ class Player:
         self.size: tuple[int, ...] | None = None
         self._factories = (ProtobufDecoders(), Ros2Decoders())
         self._found_beside: dict[int, dict[str, wire.Message]] = {}
-        if topics.depth is None:
-            logger.warning(NO_DEPTH, name)
 
     def wanted(self) -> set[str]:
         """Return the topics of the messages that `play` takes."""

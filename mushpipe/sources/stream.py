@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import select
 import threading
@@ -22,9 +23,10 @@ from mushpipe.core import wire
 from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.recording import GARBAGE, MANIFEST, Raw
 from mushpipe.core.types import RgbdFrame
-from mushpipe.sources.playing import Player, RecordedSource
+from mushpipe.sources.playing import NO_DEPTH, Player, RecordedSource
 from mushpipe.sources.topics import Topics
 
+logger = logging.getLogger("mushpipe")
 _POLL_S = 0.1
 _BUFFER = 1 << 20
 
@@ -109,6 +111,7 @@ class StreamSource(RecordedSource):
                 break
         if topics.depth not in {raw.channel.topic for raw in head}:
             topics = replace(topics, depth=None)
+            logger.warning(NO_DEPTH, "the stream")
         beside = reader.topics - set(vars(topics).values()) if self._manifest else set()
         player = Player(self, "the stream", topics, beside, bool(self._manifest), self._counts)
         wanted = player.wanted()
