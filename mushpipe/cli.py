@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mushpipe.doctor import register as register_doctor
 from mushpipe.evaluate.cli import register as register_eval
 from mushpipe.record import register as register_record
 from mushpipe.robot.commands import app as robot_app
@@ -217,6 +218,7 @@ def plugins_describe(
 
 register_eval(app)
 register_record(app)
+register_doctor(app)
 
 
 def main() -> None:
