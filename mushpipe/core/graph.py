@@ -189,7 +189,8 @@ def _node(
         return None
     if ".py:" in use:
         use = str((base / use).resolve())
-    return Node(str(at[-1]), kind, use, plugin, ports, dict(inputs), delivery)
+    paths = {k: str(v) for k, v in settings.items() if isinstance(getattr(plugin, k), Path)}
+    return Node(str(at[-1]), kind, use, plugin, ports, dict(inputs), delivery, paths=paths)
 
 
 def _drop_foreign(

@@ -117,7 +117,7 @@ class RecordingWriter:
     def close(self) -> None:
         """Write index and footer; the file is complete only after this, or broken before."""
         try:
-            if not self._output.broken:
+            if self._output.broken is None:
                 self._writer.finish()  # type: ignore[no-untyped-call]
         finally:
             self._output.close()
@@ -130,7 +130,7 @@ class _Output:
         self._file = file
         self._path = path
         self._size = 0
-        self.broken = False
+        self.broken: RecordingError | None = None
 
     def write(self, data: bytes) -> None:
         """Write all of it.
@@ -138,6 +138,8 @@ class _Output:
         Raises:
             RecordingError: It does not fit; nothing can follow that would still be readable.
         """
+        if self.broken is not None:
+            raise self.broken
         rest = memoryview(data)
         try:
             while rest:
@@ -145,8 +147,8 @@ class _Output:
                 rest = rest[written:]
                 self._size += written
         except OSError as error:
-            self.broken = True
-            raise RecordingError(self._explain(error)) from error
+            self.broken = RecordingError(self._explain(error))
+            raise self.broken from error
 
     def _explain(self, error: OSError) -> str:
         if error.errno == errno.EPIPE:

@@ -151,6 +151,22 @@ def test_the_resolved_graph_writes_out_inputs_and_delivery(lab: Lab):
     assert graph["source"] == {"use": "frames", **limits, "speed": 0.0, "count": 3}
 
 
+def test_the_manifest_names_results_as_the_user_did_and_the_recording_by_its_place(lab: Lab):
+    lab.registry.sink("mcap", "mushpipe.sinks.mcap:McapSink")
+    plan = lab.compile(
+        """
+        mushpipe: 1
+        source: {use: frames}
+        sinks: {a: {use: mcap, path: "../out/a.mcap"}, b: {use: mcap, path: b.mcap}}
+    """,
+        "b.path=here/b.mcap",
+    )
+    sinks = build_manifest(plan)["graph"]["sinks"]
+    assert (sinks["a"]["path"], sinks["b"]["path"]) == ("../out/a.mcap", "here/b.mcap")
+    resolved = plan.resolved()["sinks"]  # of a capsule, which lies elsewhere
+    assert resolved["a"]["path"] == str(lab.folder.parent / "out/a.mcap")
+
+
 def test_the_manifest_stands_beside_the_first_result(lab: Lab, graph: str):
     assert manifest_path(lab.compile(graph)) == Path("run.json")
     wanted = lab.folder / "deep" / "{recording}.results.mcap"
