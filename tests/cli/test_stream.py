@@ -158,6 +158,36 @@ def test_a_sender_whose_reader_is_gone_ends_and_says_so(folder: Path, killed: bo
     assert "the program that reads the stream has ended" in told
 
 
+# A camera that is none; the reader tells what it takes it for.
+CAMERA_PY = """\
+from typing import ClassVar
+from mushpipe import RunInfo, RgbdFrame, Sink
+from mushpipe.sources.synthetic import SyntheticSource
+
+class Cam(SyntheticSource):
+    live: ClassVar[bool] = True
+
+class Tell(Sink):
+    def open(self, run: RunInfo) -> None:
+        open("live", "w").write(str(run.live))
+    def consume(self, frame: RgbdFrame) -> None:
+        pass
+"""
+
+
+@pytest.mark.parametrize("live", [True, False])
+def test_the_reader_knows_whether_the_sender_has_a_camera(folder: Path, live: bool) -> None:
+    (folder / "cam.py").write_text(CAMERA_PY)
+    (folder / "graph.yaml").write_text(
+        'mushpipe: 1\nsource: {use: stream}\nsinks: {tell: {use: "./cam.py:Tell"}}\n'
+    )
+    source = "./cam.py:Cam" if live else "synthetic"
+    first, second = piped(folder, "--source", source, "--set", "source.count=3", "--frames", "1")
+    assert end(second)[0] == 0
+    assert end(first)[0] == 0
+    assert (folder / "live").read_text() == str(live)
+
+
 def test_what_others_print_does_not_get_into_a_stream(folder: Path) -> None:
     (folder / "graph.yaml").write_text(GRAPH.replace("out.mcap", '"-"'))
     done = subprocess.run(
