@@ -13,6 +13,7 @@ import typer
 
 from mushpipe.doctor import register as register_doctor
 from mushpipe.evaluate.cli import register as register_eval
+from mushpipe.proof.cli import register as register_proof
 from mushpipe.record import register as register_record
 from mushpipe.robot.commands import app as robot_app
 
@@ -219,6 +220,7 @@ def plugins_describe(
 register_eval(app)
 register_record(app)
 register_doctor(app)
+register_proof(app)
 
 
 def main() -> None:

@@ -19,7 +19,6 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from mushpipe.core.errors import EXIT_INTERRUPTED
-from mushpipe.core.manifest import build_manifest
 from mushpipe.core.plan import Plan
 from mushpipe.core.report import RunReport
 from mushpipe.core.run import run
@@ -93,7 +92,7 @@ def execute(
     show_report(report)
     if manifest is not None and report.exit_code != 2:  # a wrong command line is no run
         manifest.parent.mkdir(parents=True, exist_ok=True)
-        content = {**build_manifest(plan), "result": report.summary()}
+        content = {**report.manifest, "result": report.summary()}
         manifest.write_text(json.dumps(content, indent=2) + "\n")
         stderr.print(f"manifest: {manifest}", style="dim")
     if report.error is not None:
@@ -101,15 +100,22 @@ def execute(
     return report
 
 
+def durations_table(report: RunReport) -> Table:
+    """Return what each node took for a frame; the total is that of the stages."""
+    columns = ("p50 ms", "p95 ms", "p99 ms", "max ms")
+    table = Table("", *columns, box=None, pad_edge=False)
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for name, durations in {**report.durations, "all stages": report.frame}.items():
+        if durations.count:
+            table.add_row(name, *(f"{value:.2f}" for value in durations.summary().values()))
+    return table
+
+
 def show_report(report: RunReport) -> None:
     """Print the time per stage, the balance, and what was lost."""
-    if any(d.count for d in report.durations.values()):
-        table = Table("stage", "p50 ms", "p95 ms", "max ms", box=None, pad_edge=False)
-        for column in table.columns[1:]:
-            column.justify = "right"
-        for name, durations in report.durations.items():
-            table.add_row(name, *(f"{value:.2f}" for value in durations.summary().values()))
-        stderr.print(table)
+    if report.frame.count:
+        stderr.print(durations_table(report))
     rate = report.processed / report.elapsed_s if report.elapsed_s else 0.0
     stderr.print(
         f"{report.frames_in} frames in = {report.processed} processed + {report.dropped} dropped "

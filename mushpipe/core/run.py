@@ -62,7 +62,8 @@ class _Runner:
         self.stop = stop
         self.progress = progress
         self.capsules = capsules
-        self.report = RunReport(durations={node.name: Durations() for node in plan.stages})
+        nodes = (plan.source, *plan.stages, *plan.sinks)
+        self.report = RunReport(durations={node.name: Durations() for node in nodes})
         self.tolerance = 1
         self.started = time.monotonic()
         self.saved: set[str] = set()  # nodes with a failure capsule
@@ -71,9 +72,12 @@ class _Runner:
         source = self.plan.source.plugin
         if not isinstance(source, Source):
             raise TypeError("the plan's source is not a Source")
+        with _named(self.plan.source):
+            self.report.manifest = build_manifest(self.plan)
         with ExitStack() as stack:
             stack.enter_context(_opened(self.plan.source, _opener(self.plan.source)))
-            reader = SourceThread(self.plan.source, source, threading.Event())
+            durations = self.report.durations[self.plan.source.name]
+            reader = SourceThread(self.plan.source, source, threading.Event(), durations)
             info = self._begin(source, reader)
             for node in self.plan.stages:
                 stack.enter_context(_opened(node, _opener(node)))
@@ -93,10 +97,9 @@ class _Runner:
         on_error = self.plan.on_error or ("fail" if self.plan.replay() else "skip")
         self.tolerance = self.plan.max_failures if on_error == "skip" else 1
         with _named(self.plan.source):
-            manifest = build_manifest(self.plan)
             self.report.device = source.describe()
-            if self.report.device:
-                manifest["device"] = self.report.device
+            device = {"device": self.report.device} if self.report.device else {}
+            manifest = {**self.report.manifest, **device}
             info = RunInfo(source.name(), manifest, source.live, lambda: reader.box.accepted)
             self._spare_the_recording(source, info)
         return info
@@ -124,7 +127,8 @@ class _Runner:
                 logger.warning("%s", failed)
 
     def _sink_thread(self, node: Node) -> SinkThread:
-        return SinkThread(node, self.plan.delivery(node) == "latest", self.tolerance)
+        durations = self.report.durations[node.name]
+        return SinkThread(node, self.plan.delivery(node) == "latest", self.tolerance, durations)
 
     def _loop(self, reader: SourceThread, threads: list[SinkThread]) -> None:
         for thread in (reader, *threads):
@@ -195,6 +199,8 @@ class _Runner:
                 raise failed from error
             durations[node.name] = time.perf_counter_ns() - begin
             self.report.durations[node.name].add(durations[node.name])
+        if durations:  # a recorder has no stages whose time could be told
+            self.report.frame.add(sum(durations.values()))
         return Trace(frame, outputs, durations)
 
     def _call(
