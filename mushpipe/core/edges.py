@@ -6,6 +6,7 @@ import math
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import islice
 from typing import Any
 
@@ -59,6 +60,26 @@ def timed(frames: Iterator[RgbdFrame], durations: Durations) -> Iterator[RgbdFra
         durations.add(time.perf_counter_ns() - begin)
         yield frame
         begin = time.perf_counter_ns()
+
+
+@contextmanager
+def interruptible_opening(source: Source, stop: threading.Event) -> Iterator[None]:
+    """Interrupt a source that waits in its ``open``, when the run is to stop."""
+    opened = threading.Event()
+
+    def watch() -> None:
+        while not opened.wait(0.1):
+            if stop.is_set():
+                source.interrupt()
+                return
+
+    watcher = threading.Thread(target=watch, name="mushpipe-opening", daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        opened.set()
+        watcher.join()
 
 
 class SourceThread(threading.Thread):

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from mushpipe.core.capsule import write_capsule
-from mushpipe.core.edges import SinkThread, SourceThread, failure
+from mushpipe.core.edges import SinkThread, SourceThread, failure, interruptible_opening
 from mushpipe.core.errors import MushpipeError, StageError, UsageError
 from mushpipe.core.manifest import build_manifest
 from mushpipe.core.plan import Link, Node, Plan
@@ -75,7 +75,8 @@ class _Runner:
         with _named(self.plan.source):
             self.report.manifest = build_manifest(self.plan)
         with ExitStack() as stack:
-            stack.enter_context(_opened(self.plan.source, _opener(self.plan.source)))
+            with interruptible_opening(source, self.stop):
+                stack.enter_context(_opened(self.plan.source, _opener(self.plan.source)))
             durations = self.report.durations[self.plan.source.name]
             reader = SourceThread(self.plan.source, source, threading.Event(), durations)
             info = self._begin(source, reader)

@@ -73,6 +73,8 @@ class StreamSource(RecordedSource):
         except InvalidMagic as error:
             raise InputError("standard input is not MCAP: send it with -o -") from error
         except GARBAGE as error:
+            if self._interrupted.is_set():
+                return
             raise InputError("standard input is empty: see what its sender says") from error
         for record in head:
             if isinstance(record, Metadata) and record.name == MANIFEST:
@@ -111,7 +113,8 @@ class StreamSource(RecordedSource):
                 break
         if topics.depth not in {raw.channel.topic for raw in head}:
             topics = replace(topics, depth=None)
-            logger.warning(NO_DEPTH, "the stream")
+            if head:
+                logger.warning(NO_DEPTH, "the stream")
         beside = reader.topics - set(vars(topics).values()) if self._manifest else set()
         player = Player(self, "the stream", topics, beside, bool(self._manifest), self._counts)
         wanted = player.wanted()

@@ -20,7 +20,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mushpipe import Header, RgbdFrame, Stage
-from mushpipe.core.errors import EXIT_DAMAGED, EXIT_FAILED, InputError, UsageError
+from mushpipe.core.errors import (
+    EXIT_DAMAGED,
+    EXIT_FAILED,
+    EXIT_INTERRUPTED,
+    InputError,
+    UsageError,
+)
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.recording import MANIFEST, RecordingReader
 from mushpipe.core.truth import INSTANCES_TOPIC, TRUTH_TOPIC
@@ -181,16 +187,15 @@ class Tell(Sink):
 """
 
 
-@pytest.mark.parametrize("live", [True, False])
-def test_the_reader_knows_whether_the_sender_has_a_camera(folder: Path, live: bool) -> None:
+def test_the_reader_is_told_that_the_sender_has_a_camera(folder: Path) -> None:
     (folder / "cam.py").write_text(CAMERA_PY)
     (folder / "graph.yaml").write_text(
         'mushpipe: 1\nsource: {use: stream}\nsinks: {tell: {use: "./cam.py:Tell"}}\n'
     )
-    first, second = piped(folder, *(("--source", "./cam.py:Cam") if live else ("--frames", "1")))
+    first, second = piped(folder, "--source", "./cam.py:Cam")
     assert end(second)[0] == 0
     assert end(first)[0] == 0
-    assert (folder / "live").read_text() == str(live)
+    assert (folder / "live").read_text() == "True"
 
 
 def test_what_others_print_does_not_get_into_a_stream(folder: Path) -> None:
@@ -333,6 +338,23 @@ def test_a_terminal_is_no_stream() -> None:
         source.open()
     os.close(ours)
     os.close(theirs)
+
+
+def test_a_run_that_waits_for_its_sender_can_be_ended(lab: Lab) -> None:
+    read, write = os.pipe()
+    stop = threading.Event()
+
+    class Silent(StreamSource):
+        def open(self) -> None:
+            self._number = read
+            stop.set()
+            super().open()
+
+    lab.registry.source("stream", Silent)
+    report = lab.run(lab.chain("both", source="stream"), stop=stop)
+    assert (report.exit_code, report.processed) == (EXIT_INTERRUPTED, 0)
+    os.close(read)
+    os.close(write)
 
 
 def test_an_interrupted_source_stops_waiting(tmp_path: Path) -> None:
