@@ -136,9 +136,9 @@ class _Runner:
             thread.start()
         failures_in_a_row = 0
         while not reader.box.finished and not any(thread.error for thread in threads):
+            # Looked at after the loop again: an interrupted source may have ended by itself.
             if self.stop.is_set():
-                self.report.interrupted = True
-                return
+                break
             frame = reader.box.get(timeout=0.1)
             if frame is None:
                 continue
@@ -160,6 +160,7 @@ class _Runner:
             self.report.dropped = reader.box.dropped
             if self.progress:
                 self.progress(self.report)
+        self.report.interrupted = self.stop.is_set()
 
     def _wind_up(self, reader: SourceThread, source: Source, threads: list[SinkThread]) -> None:
         """Stop the threads, let the sinks finish what they were handed, and settle the counts."""
