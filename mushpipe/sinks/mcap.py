@@ -69,13 +69,7 @@ class McapSink(Sink):
 
     def consume(self, trace: Trace) -> None:
         """Write one frame and its results."""
-        writer, frame = self._writer, trace.frame
-        if writer is None or self._run is None:
-            raise RuntimeError("the sink is not open")
-        if self.split_size is not None and writer.size >= self.split_size and self.path != STDIO:
-            writer.close()
-            self._part += 1
-            writer = self._writer = self._begin(self._run)
+        writer, frame = self._next_writer(), trace.frame
         if self.frames:
             writer.frame(frame, self.jpeg_quality)
         for stage in trace.durations_ns:
@@ -85,6 +79,19 @@ class McapSink(Sink):
             content = {"stages_ns": dict(trace.durations_ns)}
             message = wire.json_message(wire.TIMING, frame.header, content)
             writer.write(wire.TIMING_TOPIC, message, frame.header)
+
+    def _next_writer(self) -> RecordingWriter:
+        """Return the writer of the part in work, or of a new one where that has its size."""
+        writer, run = self._writer, self._run
+        if writer is None or run is None:
+            raise RuntimeError("the sink is not open")
+        if self.split_size is None or self.path == STDIO or writer.size < self.split_size:
+            return writer
+        self._writer = None  # also where no new one can be begun
+        writer.close()
+        self._part += 1
+        self._writer = self._begin(run)
+        return self._writer
 
     def _write(self, writer: RecordingWriter, stage: str, value: Any, trace: Trace) -> None:
         if wire.encoder_of(type(value)) is None:
