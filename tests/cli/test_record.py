@@ -150,6 +150,48 @@ def test_a_full_disk_ends_the_recording_with_what_fits(scene: Path, tmp_path: Pa
     assert not (tmp_path / "failures").exists()
 
 
+# A camera that does not wait for anybody; it tells when it has shown all it has.
+CAMERA_PY = """\
+from collections.abc import Iterator
+from pathlib import Path
+from typing import ClassVar
+from mushpipe import Header, RgbdFrame, Source
+from tests.cli.test_record import CAMERA, picture
+
+class Fast(Source):
+    live: ClassVar[bool] = True
+
+    def frames(self) -> Iterator[RgbdFrame]:
+        for i in range(100):
+            yield RgbdFrame(Header(10**18 + i, i, "camera"), *picture(i), 0.000125, CAMERA)
+        Path("shown").touch()
+"""
+
+
+def test_what_a_disk_is_too_slow_for_is_told(tmp_path: Path) -> None:
+    """The disk is a named pipe that nobody reads until the camera is through."""
+    (tmp_path / "cam.py").write_text(CAMERA_PY)
+    os.mkfifo(tmp_path / "disk.mcap")
+    command = [*MAIN, "record", "--source", "./cam.py:Fast", "-o", "disk.mcap"]
+    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+    with (tmp_path / "disk.mcap").open("rb") as disk:
+        deadline = time.monotonic() + PATIENCE_S
+        while time.monotonic() < deadline and not (tmp_path / "shown").exists():
+            time.sleep(0.01)
+        (tmp_path / "out.mcap").write_bytes(disk.read())
+    _, told = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0, told
+    balance = re.search(r"100 frames in = (\d+) processed \+ (\d+) dropped \+ 0 failed", told)
+    assert balance is not None, told
+    kept, lost = int(balance[1]), int(balance[2])
+    assert kept + lost == 100
+    assert lost > 50
+    assert f"{lost} frames were lost because writing was too slow" in told
+    frames, damage = played(tmp_path / "out.mcap")
+    assert (len(frames), damage) == (kept, "")
+    assert (frames[0].header.sequence, frames[-1].header.sequence) == (0, 99)
+
+
 def test_every_part_of_a_split_recording_is_complete(scene: Path, tmp_path: Path) -> None:
     done = subprocess.run(
         endless(scene, "-o", "row.mcap", "--frames", "30", "--split-size", "1MB"),
