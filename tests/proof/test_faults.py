@@ -19,7 +19,8 @@ from mushpipe import RgbdFrame, Sink, Trace
 from mushpipe.core.document import parse_document, read_document
 from mushpipe.core.graph import compile_document
 from mushpipe.core.plugins import load_registry
-from mushpipe.core.recording import RecordingReader, RecordingWriter
+from mushpipe.core.recorder import RecordingWriter
+from mushpipe.core.recording import RecordingReader
 from mushpipe.core.report import RunReport
 from mushpipe.core.run import run
 from mushpipe.proof.compare import compare
