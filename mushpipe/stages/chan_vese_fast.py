@@ -216,12 +216,14 @@ def _pyramid(
         u = np.asarray(cv2.resize(solved, (width, height)), np.uint8)
     else:
         u = initial.copy()
-    u = _ictm(planes, u, mu, levels, iterations)
-    return _descend(planes, u, mu, levels, sweeps)
+    regions = _Regions(planes, u, levels)
+    u = _ictm(regions, u, mu, iterations)
+    _descend(regions, u, mu, sweeps)
+    return u
 
 
-def _ictm(planes: Planes, u: Bits, mu: float, levels: Levels | None, iterations: int) -> Bits:
-    regions, other = _Regions(planes, u, levels), np.empty_like(u)
+def _ictm(regions: _Regions, u: Bits, mu: float, iterations: int) -> Bits:
+    other = np.empty_like(u)
     pull = mu * math.sqrt(2 * math.pi) / SIGMA
     for _ in range(iterations):
         if regions.one_sided:
@@ -235,8 +237,7 @@ def _ictm(planes: Planes, u: Bits, mu: float, levels: Levels | None, iterations:
     return u
 
 
-def _descend(planes: Planes, u: Bits, mu: float, levels: Levels | None, sweeps: int) -> Bits:
-    regions = _Regions(planes, u, levels)
+def _descend(regions: _Regions, u: Bits, mu: float, sweeps: int) -> None:
     for _ in range(sweeps):
         if regions.one_sided:
             break
@@ -244,4 +245,3 @@ def _descend(planes: Planes, u: Bits, mu: float, levels: Levels | None, sweeps: 
         if not icm_sweep(plane, u, gain, offset, mu):
             break
         regions.update(u)
-    return u
