@@ -21,13 +21,14 @@ Kind = Literal["stage", "source", "sink"]
 _METHODS: dict[Kind, str] = {"stage": "process", "source": "frames", "sink": "consume"}
 
 
-def _resolve(path: Path, info: ValidationInfo) -> Path:
+def resolve_path(path: Path, info: ValidationInfo) -> Path:
+    """Return a path of a setting, relative to the graph file or to the shell; a validator."""
     context = info.context or {}
     from_shell = info.field_name in context.get("from_shell", ())
     return Path(os.path.normpath(Path("" if from_shell else context.get("base", "")) / path))
 
 
-GraphPath = Annotated[Path, AfterValidator(_resolve)]
+GraphPath = Annotated[Path, AfterValidator(resolve_path)]
 """A path setting: relative to the graph file, or to the shell where the command line set it."""
 
 
