@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from mushpipe.core.jit import jit
 from mushpipe.core.tables import Circles, Floats, Locations
@@ -58,7 +59,7 @@ def clearance(locations: Locations) -> Floats:
     diameter is unknown, and such a neighbour does not count.
     """
     radius, place = locations.diameter / 2, locations.position[:, :2]
-    gaps = np.linalg.norm(place[:, None] - place[None], axis=2) - radius[:, None] - radius[None]
+    gaps = cdist(place, place) - radius[:, None] - radius[None]
     np.fill_diagonal(gaps, np.inf)
     gap = np.fmin.reduce(gaps, axis=1, initial=np.inf)
     return np.where(np.isfinite(radius + place[:, 0]), gap, np.nan)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
 
 from mushpipe.core.tables import Circles, Columns, Floats, Locations, column
 
@@ -93,7 +94,7 @@ def _distances(new: Sightings, old: Sightings) -> Floats:
 
 
 def _steps(new: Floats, old: Floats) -> Floats:
-    return np.asarray(np.linalg.norm(new[:, None] - old[None], axis=2))
+    return cdist(new, old) if len(new) and len(old) else np.zeros((len(new), len(old)))
 
 
 def _gates(new: Floats, old: Floats) -> Floats:
@@ -115,17 +116,13 @@ def _moved(old: Sightings, new: Sightings, image: tuple[int, int]) -> Sightings:
     They are expected where they were, unless they all shifted: unless a shift brings at least half
     of those still in view, and more than no shift does, onto new ones.
     """
-    flat = _common_shift(new, old, image)
-    if flat is None:
+    stayed = _near(new, old).any(axis=0).sum()
+    if min(len(new), len(old)) < FEWEST or stayed > 0.9 * min(len(new), len(old)):
         return old
-    shifted = replace(old, center=old.center + flat)
-    near = _steps(new.center, shifted.center) <= _gates(new.radius, old.radius)
-    agreed, stayed = (
-        int(np.asarray(pairs).any(axis=0).sum())
-        for pairs in (near, _steps(new.center, old.center) <= _gates(new.radius, old.radius))
-    )
+    shifted = replace(old, center=old.center + _common_shift(new, old))
+    near = _near(new, shifted)
     in_view = ((shifted.center >= 0) & (shifted.center < image)).all(axis=1).sum()
-    if agreed < max(FEWEST, stayed + 1, 0.5 * in_view):
+    if near.any(axis=0).sum() < max(FEWEST, stayed + 1, 0.5 * in_view):
         return old
     deep = (new.position[:, None] - old.position[None])[near]
     known = deep[np.isfinite(deep).all(axis=1)]
@@ -134,21 +131,21 @@ def _moved(old: Sightings, new: Sightings, image: tuple[int, int]) -> Sightings:
     return replace(shifted, position=old.position + step)
 
 
-def _common_shift(new: Sightings, old: Sightings, image: tuple[int, int]) -> Floats | None:
+def _near(new: Sightings, old: Sightings) -> NDArray[np.bool_]:
+    """Return which pairs (N, M) lie within a gate in the image."""
+    return np.asarray(_steps(new.center, old.center) <= _gates(new.radius, old.radius))
+
+
+def _common_shift(new: Sightings, old: Sightings) -> Floats:
     """Return the shift (2,) px that most pairs of old and new circles agree on, by voting."""
-    if min(len(new), len(old)) < FEWEST:
-        return None
-    bin_px = GATE / 2 * float(np.median(new.radius))
     steps = (new.center[:, None] - old.center[None]).reshape(-1, 2)
-    half = np.ceil(np.array(image) / bin_px)
-    cells = np.rint(steps / bin_px)
-    votes = np.zeros((2 * half + 1).astype(int))
-    inside = (np.abs(cells) <= half).all(axis=1)
-    np.add.at(votes, tuple((cells[inside] + half).astype(int).T), 1)
-    # a peak may lie between bins
-    peak = np.unravel_index(uniform_filter(votes, 3, mode="constant").argmax(), votes.shape) - half
-    agreed = (np.abs(cells - peak) <= 1).all(axis=1)
-    return np.asarray(np.median(steps[agreed], axis=0))
+    cells = np.rint(steps / (GATE / 2 * float(np.median(new.radius)))).astype(int)
+    cells -= cells.min(axis=0) - 1  # with a margin, because a peak may lie between cells
+    shape = cells.max(axis=0) + 2
+    votes = np.bincount(np.ravel_multi_index(tuple(cells.T), shape), minlength=shape.prod())
+    around = uniform_filter(votes.reshape(shape).astype(np.float32), 3, mode="constant")
+    peak = np.unravel_index(around.argmax(), around.shape)
+    return np.asarray(np.median(steps[(np.abs(cells - peak) <= 1).all(axis=1)], axis=0))
 
 
 def _joined(first: Sightings, second: Sightings) -> Sightings:
