@@ -75,6 +75,10 @@ class MakePicks(Stage):
     _total: int = PrivateAttr(0)
     _missing: int = PrivateAttr(0)
 
+    def open(self) -> None:
+        """Compile the kernels."""
+        hidden_share(Circles(np.full((1, 2), 4.0), np.ones(1), np.ones(1)), np.ones(1), (8, 8))
+
     def process(
         self,
         frame: RgbdFrame,
