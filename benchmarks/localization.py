@@ -2,8 +2,9 @@
 
     python benchmarks/localization.py --family b --seeds 5000:5003
 
-The circles are those of `graphs/pick.yaml`, paired with the truth at an IoU of 0.5, whether the
-mushroom counts or not. Errors in mm; z2 is the mean of (error / stated sigma)^2.
+The circles are those of `graphs/pick.yaml`, paired with the truth by the rules of `mushpipe eval`.
+Errors in mm; z2 is the mean of (error / stated sigma)^2. `seen`: nothing hides the centre;
+`holes`: there is no depth at it.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from mushpipe import Circles, DepthSource, Locations, Mask, RgbdFrame
 from mushpipe.core.document import read_document
 from mushpipe.core.graph import compile_document
 from mushpipe.core.plugins import load_registry
+from mushpipe.core.truth import INSTANCES_TOPIC
 from mushpipe.evaluate.matching import match
 from mushpipe.evaluate.truth import FrameTruth
 from mushpipe.stages.cap_fit import CapFit
@@ -75,16 +77,20 @@ def methods() -> dict[str, Method]:
 
 
 def errors(found: Locations, taken: list[RgbdFrame], pairs: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Return per pair: error and sigma of Z, of the diameter (mm), and whether it has a hole."""
+    """Return per pair: error and sigma of Z, of the diameter (mm); has a hole; centre is seen."""
     truth, (rows, true) = truth_of(taken[0]), pairs
     # a hole: the pixel at the circle's centre has no depth
     hole = found.source[rows] == DepthSource.NEIGHBOURS
+    labels = taken[0].attached[INSTANCES_TOPIC].labels
+    u, v = np.rint(truth.center[true]).astype(int).T
+    seen = labels[v.clip(0, len(labels) - 1), u.clip(0, labels.shape[1] - 1)] == true + 1
     return np.column_stack([
         1e3 * (found.position[rows, 2] - truth.surface[true, 2]),
         1e3 * found.sigma_position[rows, 2],
         1e3 * (found.diameter[rows] - truth.diameter[true]),
         1e3 * found.sigma_diameter[rows],
         hole,
+        seen,
     ])  # fmt: skip
 
 
@@ -120,6 +126,7 @@ def accuracy(options: argparse.Namespace, detect: Callable[[RgbdFrame], Circles]
     for method, sets in tables.items():
         everything = np.concatenate([table for parts in sets.values() for table in parts])
         print(f"{method:16s} {'all':9s} {row(everything)}")
+        print(f"{method:16s} {'seen':9s} {row(everything[everything[:, 5] == 1])}")
         print(f"{method:16s} {'holes':9s} {row(everything[everything[:, 4] == 1])}")
         for name, parts in sets.items():
             print(f"{method:16s} {name:9s} {row(np.concatenate(parts))}")
