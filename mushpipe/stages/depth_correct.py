@@ -50,6 +50,8 @@ class DepthCorrect(Stage):
             return
         try:
             found = DepthCorrect.model_validate(read_document(self.calibration).data)
+            if found.calibration is not None:
+                raise ValueError("it names another file")
         except (GraphError, ValueError) as error:
             raise InputError(f"{self.calibration}: no calibration of depth: {error}") from error
         self._errors = found._errors
