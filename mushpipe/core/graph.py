@@ -189,7 +189,7 @@ def _node(
         return None
     if ".py:" in use:
         use = str((base / use).resolve())
-    paths = {k: str(v) for k, v in settings.items() if isinstance(getattr(plugin, k), Path)}
+    paths = {k: str(v) for k, v in settings.items() if isinstance(getattr(plugin, k, None), Path)}
     return Node(str(at[-1]), kind, use, plugin, ports, dict(inputs), delivery, paths=paths)
 
 
