@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
-from mushpipe.stages.cap_model import Cap, Floats, frozen, meet, slope
-from mushpipe.stages.cap_samples import COMPASS, DIRECTIONS, ray_at
+from mushpipe.stages.cap_model import Cap, Floats, Singles, frozen, meet, slope
+from mushpipe.stages.cap_samples import COMPASS, DIRECTIONS, EDGE_SHARE, ray_at, touch
 
 STEP = 0.5  # px between places on a line
 REACH = 12  # steps to either side that are looked at, at most
@@ -42,6 +42,31 @@ def expected_reach(
         step = change[0] / change[1] * focal / c[2]
         reach -= min(max(step, -0.3 * radius), 0.3 * radius)
     return reach
+
+
+@jit
+def outline_circle(c: Cap, rays: Singles, focal: float, inside: Floats, out: Floats) -> None:
+    """Fill centroid and equal-area radius (3,), px, of a cap's outline in the image.
+
+    In polar coordinates around a point inside, area = 1/2 int r^2 and centroid = 1/3 int r^3
+    (cos, sin) / area; the mean over equal angles converges faster than any power of their number.
+
+    Args:
+        c: The cap.
+        rays: (H, W, 2) rays at z = 1.
+        focal: Focal length, px.
+        inside: (3,) x, y, radius, px, of a circle near it.
+        out: (3,) out: x, y, radius, px.
+    """
+    square, x, y, n = 0.0, 0.0, 0.0, DIRECTIONS // 2
+    for j in range(n):
+        turn = COMPASS[2 * j]
+        reach = expected_reach(c, rays, focal, inside[0], inside[1], inside[2], turn)
+        square += reach**2 / n
+        x += reach**3 * turn[0] / n
+        y += reach**3 * turn[1] / n
+    out[0], out[1] = inside[0] + x / square / 1.5, inside[1] + y / square / 1.5
+    out[2] = np.sqrt(square)
 
 
 @jit
@@ -77,7 +102,8 @@ def sample_outline(
     cap: Floats,
     circle: Floats,
     focal: float,
-    out: Floats,
+    sigma: float,
+    out: Singles,
 ) -> int:
     """Find the outline of a cap in the colour image, in 32 directions.
 
@@ -89,7 +115,8 @@ def sample_outline(
         cap: (15,) the estimate.
         circle: (3,) x, y, radius, px.
         focal: Focal length, px.
-        out: (3, DIRECTIONS) out: unit rays along the outline.
+        sigma: Of a place on the outline, px.
+        out: (6, DIRECTIONS) out: rays that touch the cap, as in `touch`.
 
     Returns:
         Number of rays.
@@ -125,6 +152,6 @@ def sample_outline(
             continue
         reach = reaches[j] + (place - half) * STEP
         x, y = circle[0] + reach * COMPASS[j, 0], circle[1] + reach * COMPASS[j, 1]
-        out[0, n], out[1, n], out[2, n] = ray_at(rays, focal, x, y)
+        touch(out, n, ray_at(rays, focal, x, y), sigma * cap[2] / focal, EDGE_SHARE)
         n += 1
     return n

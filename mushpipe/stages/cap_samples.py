@@ -14,11 +14,15 @@ from numpy.typing import NDArray
 from mushpipe.core.jit import jit
 
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 Vector = tuple[float, float, float]
 GRID = 11
 DIRECTIONS = 32
 RADII = 26
 INNER, OUTER = 0.55, 1.45  # where an edge is looked for, in radii of the circle
+EDGE_PX = 2.0  # sigma of a depth edge
+# Noise and errors of shape are correlated; so much of a point, or of a ray along an edge, counts.
+POINT_SHARE, EDGE_SHARE = 0.35 * 169 / GRID**2, 0.6
 CORE = 0.35  # squared share of the radius inside which the middle depth is taken
 
 _CENTERS = (np.arange(GRID) + 0.5) / GRID * 2 - 1
@@ -113,7 +117,7 @@ def sample_depth(
     circle: Floats,
     focal: float,
     noise: tuple[float, float],
-    out: Floats,
+    out: Singles,
 ) -> tuple[int, float]:
     """Take the points of a cap: block means on a grid inside its circle, gated around its depth.
 
@@ -123,7 +127,7 @@ def sample_depth(
         circle: (3,) x, y, radius, px.
         focal: Focal length, px.
         noise: Sigma of depth is noise[0] + noise[1] z, m.
-        out: (5, M) out: unit ray, range (m), sigma of the range (m).
+        out: (6, M) out: unit ray, range and its sigma (m), share that counts as independent.
 
     Returns:
         Number of points, and the cap's middle depth (m), 0 where there is none.
@@ -155,6 +159,7 @@ def sample_depth(
         out[0, n], out[1, n], out[2, n] = points[j, 0] / length, points[j, 1] / length, 1 / length
         out[3, n] = z * length
         out[4, n] = sigma * (0.3 + 0.7 / np.sqrt(count[j])) * length
+        out[5, n] = POINT_SHARE
         n += 1
     return n, middle
 
@@ -215,7 +220,7 @@ def sample_edges(
     focal: float,
     middle: float,
     offset: float,
-    out: Floats,
+    out: Singles,
 ) -> int:
     """Find the depth edge of a cap in 32 directions.
 
@@ -226,7 +231,7 @@ def sample_edges(
         focal: Focal length, px.
         middle: Middle depth of the cap, m.
         offset: How much of its edge the sensor loses, px.
-        out: (3, DIRECTIONS) out: unit rays along the edge.
+        out: (6, DIRECTIONS) out: rays that touch the cap, as in `touch`.
 
     Returns:
         Number of trusted edge rays.
@@ -245,9 +250,16 @@ def sample_edges(
             continue
         reach = INNER * radius + (edge + 0.5) * step + offset
         ray = ray_at(rays, focal, x + reach * dx, y + reach * dy)
-        out[0, n], out[1, n], out[2, n] = ray
+        touch(out, n, ray, EDGE_PX * middle / focal, EDGE_SHARE)
         n += 1
     return n
+
+
+@jit
+def touch(out: Singles, n: int, ray: Vector, sigma: float, share: float) -> None:
+    """Fill column n of rays (6, M) with one that touches the cap, within sigma (m)."""
+    out[0, n], out[1, n], out[2, n] = ray
+    out[3, n], out[4, n], out[5, n] = 0.0, sigma, share
 
 
 @jit

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from mushpipe import Camera, Circles, DepthSource, InputError, Locations, Poses, RgbdFrame
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_model import ROOM, SIZE, depth_rows, move, span, tangent_rows
+from mushpipe.stages.cap_model import ROOM, SIZE, fill_rows, move, span
 from mushpipe.stages.upright import pixel_rays, upright
 from tests.stages.caps import CAMERA, Cap, cap, circles_of, draw, frame_from
 
@@ -209,16 +209,15 @@ def test_derivatives_agree_with_finite_differences(kind: str, bulge: float) -> N
     far = rng.uniform(0, 0.75, count) if kind == "depth" else rng.uniform(0.97, 1.03, count)
     offset = state[6] * far[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     target = state[:3] + np.column_stack([offset, np.zeros(count)])
-    points = np.zeros((5, count))
+    points = np.zeros((4, count))
     points[3] = np.linalg.norm(target, axis=1)
     points[:3] = (target / points[3][:, None]).T
+    if kind == "tangent":
+        points[3] = 0  # a ray that touches
 
     def rows(at: np.ndarray) -> np.ndarray:
         flat = np.zeros(14 * ROOM)
-        if kind == "depth":
-            depth_rows(at, points, count, flat)
-        else:
-            tangent_rows(at, points[:3].copy(), count, flat)
+        fill_rows(at, points, count, flat)
         return flat.reshape(14, ROOM)[:, :count]
 
     base, eps = rows(state), 1e-7
