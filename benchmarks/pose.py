@@ -70,9 +70,8 @@ def main() -> None:
         "depth-correct": lambda: DepthCorrect(offset_mm=2.85).process(frame),
     }
     times = {name: milliseconds(call, options.repeats) for name, call in calls.items()}
-    few = Circles(
-        *(a[: options.registrations] for a in (circles.center, circles.radius, circles.score))
-    )
+    spread = np.linspace(0, len(circles) - 1, options.registrations).astype(int)
+    few = Circles(circles.center[spread], circles.radius[spread], circles.score[spread])
     where = nearest.process(frame, few)
     rng = np.random.default_rng(0)
     times["registration"] = milliseconds(lambda: register.process(frame, few, where, rng), 3)

@@ -23,7 +23,7 @@ from mushpipe.stages.cap_model import (
     meet,
     slope,
 )
-from mushpipe.stages.cap_outline import outline_circle, sample_outline
+from mushpipe.stages.cap_outline import expected_reach, outline_circle, sample_outline
 from mushpipe.stages.cap_samples import (
     CELLS,
     COMPASS,
@@ -38,7 +38,7 @@ from mushpipe.stages.cap_solve import ROUND, Noise, invert, refine, tilt, worksp
 from mushpipe.stages.cap_start import spread_of, start
 
 ROUNDNESS = 0.015  # in rim radii: how far the rim of a cap is from the circle of its area
-BAD = 2.0  # times the usual misfit: from there on a cap is sampled anew
+BAD = 3.0  # times the usual misfit: from there on a cap is sampled anew
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +99,7 @@ def core_depth(depth: NDArray[np.float32], circle: Floats) -> float:
 
 @jit
 def rank_by_depth(
-    depth: NDArray[np.float32], circles: Floats, ranks: NDArray[np.int32]
+    depth: NDArray[np.float32], circles: Floats, ranks: NDArray[np.int16]
 ) -> NDArray[np.int64]:
     """Return each circle's rank (N,), the nearest 0, and paint them over a `ranks` full of N."""
     far = np.empty(len(circles))
@@ -169,7 +169,7 @@ def fit_once(
     if refine(cap, rays, count, upright, setting, (0, 2), work)[0] < 0.0:
         return -1.0
     lines = sample_outline(
-        gray, image[1], image[2], rank, cap, circle, focal, outline_px, rays[:, count:]
+        gray, image[1], image[2], rank, cap, circle, focal, outline_px, work[1], rays[:, count:]
     )
     weight, misfit = refine(cap, rays, count + lines, upright, setting, (2, 4), work)
     if weight < 0.0:
@@ -200,6 +200,7 @@ def first_fits(
     _, image, focal = frame
     caps, covariances, _, found, counts = out
     rank, work = rank_by_depth(image[0], circles, image[2]), workspace()
+    reach = np.empty(DIRECTIONS)
     again = (
         np.empty((6, ROOM), np.float32), np.empty(SIZE), np.empty((UNKNOWNS, UNKNOWNS)),
         np.zeros(6),
@@ -209,7 +210,8 @@ def first_fits(
         misfit = fit_once(frame, circles[i], circles[i], rank[i], upright, settings, own, work)
         if misfit < BAD * settings[0].usual:
             continue
-        outline_circle(frozen(caps[i]), image[1], focal, circles[i], found[i])
+        expected_reach(caps[i], image[1], focal, circles[i], work[1], reach)
+        outline_circle(circles[i], reach, found[i])
         second = fit_once(frame, found[i], circles[i], rank[i], upright, settings, again, work)
         if 0.0 <= second < misfit:
             rays[i], caps[i], covariances[i], counts[i] = again
@@ -230,7 +232,7 @@ def second_fits(
             first, second = tilt(caps[i], upright[0])
             squares[i] = first * first + second * second
             variances[i] = 0.5 * (covariances[i, 3, 3] + covariances[i, 4, 4])
-    spreads, work = np.empty(len(caps)), workspace()
+    spreads, reach, work = np.empty(len(caps)), np.empty(DIRECTIONS), workspace()
     spread_of(squares, variances, upright[1], spreads)
     for i in range(len(caps)):
         if counts[i, 0] == 0:
@@ -242,7 +244,8 @@ def second_fits(
         invert(work[0][0], covariances[i])
         ray = ray_at(image[1], focal, circles[i, 0], circles[i, 1])
         locate(caps[i], ray, covariances[i], noise.circle_px / focal, surfaces[i])
-        outline_circle(frozen(caps[i]), image[1], focal, circles[i], found[i])
+        expected_reach(caps[i], image[1], focal, circles[i], work[1], reach)
+        outline_circle(circles[i], reach, found[i])
 
 
 @jit
@@ -301,7 +304,7 @@ def fit_caps(
         np.zeros((n, 6)),
     )
     rays = np.empty((n, 6, ROOM), np.float32)
-    ranked = (gray, (*image, np.full(image[0].shape, n, np.int32)), focal)
+    ranked = (gray, (*image, np.full(image[0].shape, n, np.int16)), focal)
     first_fits(ranked, circles, upright, settings, rays, out)
     second_fits(ranked, circles, upright, settings, rays, out)
     return _fits(*out)

@@ -34,7 +34,7 @@ COMPASS: Floats = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=-1)
 
 
 @jit
-def paint(ranks: NDArray[np.int32], circles: Floats, order: NDArray[np.int64]) -> None:
+def paint(ranks: NDArray[np.int16], circles: Floats, order: NDArray[np.int64]) -> None:
     """Write into each pixel the rank of the nearest circle that covers it.
 
     Args:
@@ -55,9 +55,8 @@ def paint(ranks: NDArray[np.int32], circles: Floats, order: NDArray[np.int64]) -
 
 @jit
 def block(
-    depth: NDArray[np.float32],
-    rays: NDArray[np.float32],
-    ranks: NDArray[np.int32],
+    depth: Singles,
+    ranks: NDArray[np.int16],
     rank: int,
     place: tuple[int, int, int],
     out: Floats,
@@ -66,33 +65,32 @@ def block(
 
     Args:
         depth: (H, W) m, 0 = missing.
-        rays: (H, W, 2) x and y of each pixel's ray at z = 1; beyond 1e3 where it has none.
         ranks: (H, W) rank of the nearest circle that covers the pixel.
         rank: This circle's; pixels of a lower one are hidden.
         place: u, v, half width of the block, px.
-        out: (4,) out: mean x and y of the rays, mean depth (m) and its variance.
+        out: (4,) out: mean u and v (px), mean depth (m) and its variance.
 
     Returns:
         How many pixels were valid.
     """
     height, width = depth.shape
     u0, v0, half = place
-    count, sx, sy, sz, szz = 0, 0.0, 0.0, 0.0, 0.0
+    count, su, sv, sz, szz = 0, 0, 0, 0.0, 0.0
     first = 0.0
     for v in range(max(0, v0 - half), min(height, v0 + half + 1)):
         for u in range(max(0, u0 - half), min(width, u0 + half + 1)):
             z = float(depth[v, u])
-            if z <= 0.0 or ranks[v, u] < rank or rays[v, u, 0] > 1e3:
+            if z <= 0.0 or ranks[v, u] < rank:
                 continue
             if count == 0:
                 first = z
             count += 1
-            sx += rays[v, u, 0]
-            sy += rays[v, u, 1]
+            su += u
+            sv += v
             sz += z - first
             szz += (z - first) * (z - first)
     if count:
-        out[0], out[1], out[2] = sx / count, sy / count, first + sz / count
+        out[0], out[1], out[2] = su / count, sv / count, first + sz / count
         out[3] = max(szz / count - (sz / count) ** 2, 0.0)
     return count
 
@@ -122,7 +120,8 @@ def sample_depth(
     """Take the points of a cap: block means on a grid inside its circle, gated around its depth.
 
     Args:
-        image: Depth (H, W), rays (H, W, 2) and ranks (H, W) as in `block`.
+        image: Depth (H, W), rays (H, W, 2) at z = 1, beyond 1e3 where a pixel has none, and ranks
+            (H, W) as in `block`.
         rank: This circle's.
         circle: (3,) x, y, radius, px.
         focal: Focal length, px.
@@ -141,7 +140,7 @@ def sample_depth(
     for j in range(len(CELLS)):
         u = int(np.floor(circle[0] + radius * CELLS[j, 0] + 0.5))
         v = int(np.floor(circle[1] + radius * CELLS[j, 1] + 0.5))
-        count[j] = block(depth, rays, ranks, rank, (u, v, half), points[j])
+        count[j] = block(depth, ranks, rank, (u, v, half), points[j])
     middle = middle_depth(points, count, half)
     if middle <= 0.0:
         return 0, 0.0
@@ -155,10 +154,11 @@ def sample_depth(
             continue
         if not middle - 0.8 * size < z < middle + size:
             continue
-        length = np.sqrt(1.0 + points[j, 0] ** 2 + points[j, 1] ** 2)
-        out[0, n], out[1, n], out[2, n] = points[j, 0] / length, points[j, 1] / length, 1 / length
-        out[3, n] = z * length
-        out[4, n] = sigma * (0.3 + 0.7 / np.sqrt(count[j])) * length
+        ray = ray_at(rays, focal, points[j, 0], points[j, 1])
+        if ray[2] < 1e-3:
+            continue  # where the lens has none
+        out[0, n], out[1, n], out[2, n], out[3, n] = ray[0], ray[1], ray[2], z / ray[2]
+        out[4, n] = sigma * (0.3 + 0.7 / np.sqrt(count[j])) / ray[2]
         out[5, n] = POINT_SHARE
         n += 1
     return n, middle
@@ -167,7 +167,7 @@ def sample_depth(
 @jit
 def edge_along(
     depth: NDArray[np.float32],
-    ranks: NDArray[np.int32],
+    ranks: NDArray[np.int16],
     rank: int,
     line: tuple[float, float, float, float],
     gate: tuple[float, float],
