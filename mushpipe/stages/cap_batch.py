@@ -23,12 +23,12 @@ from mushpipe.stages.cap_model import (
     meet,
     slope,
 )
+from mushpipe.stages.cap_order import rank_by_depth
 from mushpipe.stages.cap_outline import expected_reach, outline_circle, sample_outline
 from mushpipe.stages.cap_samples import (
     CELLS,
     COMPASS,
     DIRECTIONS,
-    paint,
     ray_at,
     sample_depth,
     sample_edges,
@@ -61,7 +61,6 @@ class Fits:
         edges: (N,) number of rays along the depth edge.
         lines: (N,) number of rays along the outline in colour.
         misfit: (N,) mean squared residual, in sigmas.
-        outline: (N, 3) px, centroid and equal-area radius of the cap's outline in the image.
     """
 
     valid: NDArray[np.bool_]
@@ -79,40 +78,6 @@ class Fits:
     edges: NDArray[np.int64]
     lines: NDArray[np.int64]
     misfit: Floats
-    outline: Floats
-
-
-@jit
-def core_depth(depth: NDArray[np.float32], circle: Floats) -> float:
-    """Return the median depth (m) near the centre of a circle (x, y, r), 0 without any."""
-    values = np.empty(81)
-    n = 0
-    for i in range(-4, 5):
-        for j in range(-4, 5):
-            u = int(np.floor(circle[0] + 0.12 * i * circle[2] + 0.5))
-            v = int(np.floor(circle[1] + 0.12 * j * circle[2] + 0.5))
-            if 0 <= v < depth.shape[0] and 0 <= u < depth.shape[1] and depth[v, u] > 0:
-                values[n] = depth[v, u]
-                n += 1
-    return float(np.median(values[:n])) if n else 0.0
-
-
-@jit
-def rank_by_depth(
-    depth: NDArray[np.float32], circles: Floats, ranks: NDArray[np.int16]
-) -> NDArray[np.int64]:
-    """Return each circle's rank (N,), the nearest 0, and paint them over a `ranks` full of N."""
-    far = np.empty(len(circles))
-    for i in range(len(circles)):
-        far[i] = core_depth(depth, circles[i])
-        if far[i] <= 0.0:
-            far[i] = 1e30  # hides nothing
-    order = np.argsort(far)
-    paint(ranks, circles, order)
-    rank = np.empty(len(circles), np.int64)
-    for k in range(len(circles)):
-        rank[order[k]] = k
-    return rank
 
 
 @jit
@@ -193,14 +158,13 @@ def first_fits(
         settings: `Noise`; sigma of depth (2), bias (m) and edge offset (px); sigma of the outline
             in colour, px; fewest points.
         rays: (N, 6, ROOM) room for those of each cap.
-        out: Per cap parameters, covariance, surface point with sigmas, outline in the image, and
-            counts of points, edge rays, outline rays, weight; size, m; and misfit. A cap without a
-            fit keeps a count of 0.
+        out: Per cap parameters, covariance, surface point with sigmas, and counts of points, edge
+            rays, outline rays, weight; size, m; and misfit. A cap without a fit keeps a count of 0.
     """
     _, image, focal = frame
-    caps, covariances, _, found, counts = out
+    caps, covariances, _, counts = out
     rank, work = rank_by_depth(image[0], circles, image[2]), workspace()
-    reach = np.empty(DIRECTIONS)
+    circle, reach = np.empty(3), np.empty(DIRECTIONS)
     again = (
         np.empty((6, ROOM), np.float32), np.empty(SIZE), np.empty((UNKNOWNS, UNKNOWNS)),
         np.zeros(6),
@@ -211,8 +175,8 @@ def first_fits(
         if misfit < BAD * settings[0].usual:
             continue
         expected_reach(caps[i], image[1], focal, circles[i], work[1], reach)
-        outline_circle(circles[i], reach, found[i])
-        second = fit_once(frame, found[i], circles[i], rank[i], upright, settings, again, work)
+        outline_circle(circles[i], reach, circle)
+        second = fit_once(frame, circle, circles[i], rank[i], upright, settings, again, work)
         if 0.0 <= second < misfit:
             rays[i], caps[i], covariances[i], counts[i] = again
 
@@ -225,14 +189,14 @@ def second_fits(
     """Refine every fit with what the scene says of its caps' tilt; arguments as `first_fits`."""
     _, image, focal = frame
     noise = settings[0]
-    caps, covariances, surfaces, found, counts = out
+    caps, covariances, surfaces, counts = out
     squares, variances = np.full(len(caps), -1.0), np.ones(len(caps))
     for i in range(len(caps)):
         if counts[i, 0] > 0:
             first, second = tilt(caps[i], upright[0])
             squares[i] = first * first + second * second
             variances[i] = 0.5 * (covariances[i, 3, 3] + covariances[i, 4, 4])
-    spreads, reach, work = np.empty(len(caps)), np.empty(DIRECTIONS), workspace()
+    spreads, work = np.empty(len(caps)), workspace()
     spread_of(squares, variances, upright[1], spreads)
     for i in range(len(caps)):
         if counts[i, 0] == 0:
@@ -244,8 +208,6 @@ def second_fits(
         invert(work[0][0], covariances[i])
         ray = ray_at(image[1], focal, circles[i, 0], circles[i, 1])
         locate(caps[i], ray, covariances[i], noise.circle_px / focal, surfaces[i])
-        expected_reach(caps[i], image[1], focal, circles[i], work[1], reach)
-        outline_circle(circles[i], reach, found[i])
 
 
 @jit
@@ -300,7 +262,6 @@ def fit_caps(
         np.full((n, SIZE), np.nan),
         np.full((n, UNKNOWNS, UNKNOWNS), np.nan),
         np.full((n, 6), np.nan),
-        np.full((n, 3), np.nan),
         np.zeros((n, 6)),
     )
     rays = np.empty((n, 6, ROOM), np.float32)
@@ -310,12 +271,10 @@ def fit_caps(
     return _fits(*out)
 
 
-def _fits(
-    caps: Floats, covariances: Floats, surfaces: Floats, found: Floats, counts: Floats
-) -> Fits:
+def _fits(caps: Floats, covariances: Floats, surfaces: Floats, counts: Floats) -> Fits:
     finite = np.isfinite(caps).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
     valid = (counts[:, 0] > 0) & (counts[:, 3] >= 0) & finite & np.isfinite(surfaces).all(axis=1)
-    for array in (caps, covariances, surfaces, found):
+    for array in (caps, covariances, surfaces):
         array[~valid] = np.nan
     diagonal = np.diagonal(covariances, axis1=1, axis2=2)
     center, axis = caps[:, :3], caps[:, N : N + 3]
@@ -335,5 +294,4 @@ def _fits(
         counts[:, 1].astype(np.int64),
         counts[:, 2].astype(np.int64),
         counts[:, 5],
-        found,
     )

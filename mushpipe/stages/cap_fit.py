@@ -101,7 +101,7 @@ class CapFit(Stage):
             aspect=0.62,
             aspect_sigma=0.2,
             bulge=0.0,
-            bulge_sigma=0.06,
+            bulge_sigma=0.08,
             firm=15.0,
             usual=0.25,
         )

@@ -34,26 +34,6 @@ COMPASS: Floats = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=-1)
 
 
 @jit
-def paint(ranks: NDArray[np.int16], circles: Floats, order: NDArray[np.int64]) -> None:
-    """Write into each pixel the rank of the nearest circle that covers it.
-
-    Args:
-        ranks: (H, W) out; the nearest circle has rank 0, where there is none it stays as it is.
-        circles: (N, 3) x, y, radius, px.
-        order: (N,) rows of the circles, the nearest first.
-    """
-    height, width = ranks.shape
-    for rank in range(len(order) - 1, -1, -1):
-        x, y, r = circles[order[rank]]
-        for v in range(max(0, int(np.ceil(y - r))), min(height, int(np.floor(y + r)) + 1)):
-            half = np.sqrt(max(r * r - (v - y) ** 2, 0.0))
-            left = max(0, int(np.ceil(x - half)))
-            right = min(width, int(np.floor(x + half)) + 1)
-            for u in range(left, right):
-                ranks[v, u] = rank
-
-
-@jit
 def block(
     depth: Singles,
     ranks: NDArray[np.int16],
