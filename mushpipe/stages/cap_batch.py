@@ -24,7 +24,7 @@ from mushpipe.stages.cap_model import (
     slope,
 )
 from mushpipe.stages.cap_order import rank_by_depth
-from mushpipe.stages.cap_outline import expected_reach, outline_circle, sample_outline
+from mushpipe.stages.cap_outline import sample_outline
 from mushpipe.stages.cap_samples import (
     CELLS,
     COMPASS,
@@ -38,7 +38,6 @@ from mushpipe.stages.cap_solve import ROUND, Noise, invert, refine, tilt, worksp
 from mushpipe.stages.cap_start import spread_of, start
 
 ROUNDNESS = 0.015  # in rim radii: how far the rim of a cap is from the circle of its area
-BAD = 3.0  # times the usual misfit: from there on a cap is sampled anew
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +83,6 @@ class Fits:
 def gather(
     image: Any,
     circle: Floats,
-    detected: Floats,
     rank: int,
     focal: float,
     sensor: tuple[float, float, float, float],
@@ -99,49 +97,9 @@ def gather(
     m = sample_edges(image, rank, circle, focal, middle, sensor[3], rays[:, ROUND + n :])
     for j in range(ROUND):
         turn = COMPASS[j * (DIRECTIONS // ROUND)]
-        x, y = detected[0] + detected[2] * turn[0], detected[1] + detected[2] * turn[1]
+        x, y = circle[0] + circle[2] * turn[0], circle[1] + circle[2] * turn[1]
         touch(rays, j, ray_at(image[1], focal, x, y), 0.0, 0.0)
     return n, m, middle - sensor[2]
-
-
-@jit
-def fit_once(
-    frame: Any, circle: Floats, detected: Floats, rank: int, upright: tuple[Floats, float],
-    settings: Any, out: Any, work: Any,
-) -> float:  # fmt: skip
-    """Gather the rays of a cap within a circle and fit it; return the misfit, -1 without a fit.
-
-    Args:
-        frame: As in `first_fits`.
-        circle: (3,) x, y, radius, px, in which the cap is sampled.
-        detected: (3,) the circle that touches it.
-        rank: Of the circle by depth.
-        upright: Unit vector (3,) and spread of tilts, rad.
-        settings: As in `first_fits`.
-        out: Rays (6, ROOM), cap (15,), covariance (8, 8) and counts (6,).
-        work: From `workspace`.
-    """
-    gray, image, focal = frame
-    noise, sensor, outline_px, least = settings
-    rays, cap, covariance, counts = out
-    n, m, middle = gather(image, circle, detected, rank, focal, sensor, rays)
-    if n < least or middle <= 0.0:
-        return -1.0
-    size = circle[2] * middle / focal
-    ray = ray_at(image[1], focal, circle[0], circle[1])
-    start(cap, rays[:, ROUND:], n, upright[0], ray, middle, size)
-    setting, count = (noise, 1.0 / focal, size), ROUND + n + m
-    if refine(cap, rays, count, upright, setting, (0, 2), work)[0] < 0.0:
-        return -1.0
-    lines = sample_outline(
-        gray, image[1], image[2], rank, cap, circle, focal, outline_px, work[1], rays[:, count:]
-    )
-    weight, misfit = refine(cap, rays, count + lines, upright, setting, (2, 4), work)
-    if weight < 0.0:
-        return -1.0
-    invert(work[0][0], covariance)
-    counts[0], counts[1], counts[2], counts[4] = n, m, lines, size
-    return misfit
 
 
 @jit
@@ -149,7 +107,7 @@ def first_fits(
     frame: Any, circles: Floats, upright: tuple[Floats, float], settings: Any, rays: Singles,
     out: Any,
 ) -> None:  # fmt: skip
-    """Fit every cap with the same prior; a bad fit once more, sampled in the outline it found.
+    """Gather the rays of every cap, and fit it with the same prior for all.
 
     Args:
         frame: Luma (H, W), image (see `sample_depth`) and focal length, px.
@@ -161,24 +119,29 @@ def first_fits(
         out: Per cap parameters, covariance, surface point with sigmas, and counts of points, edge
             rays, outline rays, weight; size, m; and misfit. A cap without a fit keeps a count of 0.
     """
-    _, image, focal = frame
+    gray, image, focal = frame
+    noise, sensor, outline_px, least = settings
     caps, covariances, _, counts = out
     rank, work = rank_by_depth(image[0], circles, image[2]), workspace()
-    circle, reach = np.empty(3), np.empty(DIRECTIONS)
-    again = (
-        np.empty((6, ROOM), np.float32), np.empty(SIZE), np.empty((UNKNOWNS, UNKNOWNS)),
-        np.zeros(6),
-    )  # fmt: skip
     for i in range(len(circles)):
-        own = (rays[i], caps[i], covariances[i], counts[i])
-        misfit = fit_once(frame, circles[i], circles[i], rank[i], upright, settings, own, work)
-        if misfit < BAD * settings[0].usual:
+        circle, seen = circles[i], rays[i]
+        n, m, middle = gather(image, circle, rank[i], focal, sensor, seen)
+        if n < least or middle <= 0.0:
             continue
-        expected_reach(caps[i], image[1], focal, circles[i], work[1], reach)
-        outline_circle(circles[i], reach, circle)
-        second = fit_once(frame, circle, circles[i], rank[i], upright, settings, again, work)
-        if 0.0 <= second < misfit:
-            rays[i], caps[i], covariances[i], counts[i] = again
+        size = circle[2] * middle / focal
+        ray = ray_at(image[1], focal, circle[0], circle[1])
+        start(caps[i], seen[:, ROUND:], n, upright[0], ray, middle, size)
+        setting, count = (noise, 1.0 / focal, size), ROUND + n + m
+        if refine(caps[i], seen, count, upright, setting, (0, 2), work)[0] < 0.0:
+            continue
+        lines = sample_outline(
+            gray, image[1], image[2], rank[i], caps[i], circle, focal, outline_px, work[1],
+            seen[:, count:],
+        )  # fmt: skip
+        if refine(caps[i], seen, count + lines, upright, setting, (2, 4), work)[0] < 0.0:
+            continue
+        invert(work[0][0], covariances[i])
+        counts[i, 0], counts[i, 1], counts[i, 2], counts[i, 4] = n, m, lines, size
 
 
 @jit

@@ -56,27 +56,6 @@ def expected_reach(
 
 
 @jit
-def outline_circle(circle: Floats, reach: Floats, out: Floats) -> None:
-    """Fill centroid and equal-area radius (3,), px, of an outline.
-
-    In polar coordinates around a point inside, area = 1/2 int r^2 and centroid = 1/3 int r^3
-    (cos, sin) / area; the mean over equal angles converges faster than any power of their number.
-
-    Args:
-        circle: (3,) whose centre lies inside.
-        reach: (DIRECTIONS,) from `expected_reach`, px.
-        out: Out: x, y, radius, px.
-    """
-    square, x, y = 0.0, 0.0, 0.0
-    for j in range(DIRECTIONS):
-        square += reach[j] ** 2
-        x += reach[j] ** 3 * COMPASS[j, 0]
-        y += reach[j] ** 3 * COMPASS[j, 1]
-    out[0], out[1] = circle[0] + x / square / 1.5, circle[1] + y / square / 1.5
-    out[2] = np.sqrt(square / DIRECTIONS)
-
-
-@jit
 def steepest(profile: Floats, count: int, sign: float) -> tuple[float, float]:
     """Return where a profile (count,) falls (sign 1) or rises (-1) most steeply, and by how much.
 
