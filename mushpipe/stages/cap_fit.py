@@ -43,7 +43,7 @@ class CapFit(Stage):
     depth_noise_mm: float = Field(0.3, ge=0, description="sigma of depth at the camera, mm")
     depth_noise_per_m: float = Field(1.2, ge=0, description="its growth with depth, mm per m")
     edge_offset_px: float = Field(
-        0.45, ge=-3, le=3, description="how much of a cap's edge the depth camera loses, px"
+        0.7, ge=-3, le=3, description="how much of a cap's edge the depth camera loses, px"
     )
     circle_sigma_px: float = Field(1, gt=0, description="sigma of the circles, px")
     outline_sigma_px: float = Field(

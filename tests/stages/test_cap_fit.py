@@ -192,6 +192,25 @@ def test_where_tilt_cannot_be_seen_the_sigma_says_so() -> None:
     assert ball.sigma_rad[0] > 2 * flat.sigma_rad[0]
 
 
+def test_a_cap_that_does_not_fit_the_model_says_so_in_its_sigmas() -> None:
+    true = cap(15, 60, (0, 0, 0.4), 0.022, 0.55)
+    depth, gray = draw([true], 0.44)
+    v, u = np.mgrid[:240, :320]
+    knobs = 0.003 * np.sin(u / 5) * np.sin(v / 5)
+    stage, circles = CapFit(up="camera"), circles_of([true])
+    locations, poses = stage.process(frame_from(depth, gray), circles)
+    lumpy = np.where(depth < 0.44, depth + knobs, depth)
+    others, lumps = stage.process(frame_from(lumpy, gray), circles)
+    assert lumps.sigma_rad[0] > 1.3 * poses.sigma_rad[0]
+    assert others.sigma_diameter[0] > 1.2 * locations.sigma_diameter[0]
+    assert angle(lumps.axis[0], true.axis) < 3 * np.degrees(lumps.sigma_rad[0])
+
+
+def test_an_upright_without_direction_is_refused() -> None:
+    with pytest.raises(ValueError, match="the upright has no direction"):
+        CapFit.model_validate({"up": [0, 0, 0]})
+
+
 def some_cap(bulge: float) -> np.ndarray:
     values = np.zeros(SIZE)
     values[:3] = [0.01, -0.02, 0.41]
