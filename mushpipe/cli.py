@@ -14,6 +14,7 @@ import typer
 
 from mushpipe.evaluate.cli import register as register_eval
 from mushpipe.robot.commands import app as robot_app
+from mushpipe.viewing import register as register_viewing
 
 if TYPE_CHECKING:
     from mushpipe.core.plan import Plan
@@ -257,6 +258,7 @@ def plugins_describe(
 
 
 register_eval(app)
+register_viewing(app)
 
 
 def main() -> None:
