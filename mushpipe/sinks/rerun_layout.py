@@ -1,0 +1,83 @@
+"""How the Rerun viewer shows a run: one tab with switchable layers, space, plots and the log."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+IMAGE = "camera/image"
+# layers of the image by what a stage puts out, in the order in which they are drawn
+FRAMES, INITIAL, MASKS = f"{IMAGE}/frames", f"{IMAGE}/initial", f"{IMAGE}/masks"
+CIRCLES, PICKS = f"{IMAGE}/circles", f"{IMAGE}/picks"
+COLOR, DEPTH, HOLES = f"{IMAGE}/color", f"{IMAGE}/depth", f"{IMAGE}/holes"
+CLOUD, CAPS, AXES, TARGETS = "camera/cloud", "camera/caps", "camera/axes", "camera/picks"
+ORDER, WORKSPACE = "camera/order", "camera/workspace"
+COUNTS, TIMES, VALIDITY, LOG = "plots/count", "plots/time", "plots/depth", "log"
+HIDDEN_AT_FIRST = (FRAMES, INITIAL, CIRCLES)
+
+
+def layout(layers: Sequence[str], distance: float) -> Any:
+    """Return the blueprint of a run.
+
+    Args:
+        layers: Entities of the image that the run's stages fill, in drawing order. Of the masks
+            the last is shown; every layer can be switched in the panel at the left.
+        distance: From the camera to the bed, m, for the first look from the side.
+    """
+    import rerun.blueprint as rrb
+
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(
+                _image_view(layers),
+                rrb.Horizontal(
+                    rrb.TimeSeriesView(origin=COUNTS, name="Mushrooms"),
+                    rrb.TimeSeriesView(origin=TIMES, name="Time per stage, ms"),
+                    rrb.TimeSeriesView(origin=VALIDITY, name="Depth valid, %"),
+                ),
+                row_shares=[3, 1],
+            ),
+            rrb.Vertical(
+                _space_view(distance),
+                rrb.Spatial2DView(origin=IMAGE, name="Depth, holes red", contents=[DEPTH, HOLES]),
+                rrb.TextLogView(origin=LOG, name="Log"),
+                row_shares=[3, 2, 1],
+            ),
+            column_shares=[3, 2],
+        ),
+        rrb.TimePanel(state="collapsed", timeline="frame"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.BlueprintPanel(state="expanded"),
+    )
+
+
+def _image_view(layers: Sequence[str]) -> Any:
+    import rerun.blueprint as rrb
+
+    masks = [layer for layer in layers if layer.startswith(MASKS)]
+    hidden = [layer for layer in layers if layer.startswith(HIDDEN_AT_FIRST)] + masks[:-1]
+    if PICKS not in layers:  # the circles are all there is
+        hidden = [layer for layer in hidden if not layer.startswith(CIRCLES)]
+    return rrb.Spatial2DView(
+        origin=IMAGE,
+        name="Image",
+        contents=[COLOR, *layers],
+        overrides={layer: rrb.EntityBehavior(visible=False) for layer in hidden},
+    )
+
+
+def _space_view(distance: float) -> Any:
+    import rerun.blueprint as rrb
+
+    return rrb.Spatial3DView(
+        origin="camera",
+        name="Bed",
+        contents=[IMAGE, CLOUD, CAPS, AXES, TARGETS, ORDER, WORKSPACE],
+        eye_controls=rrb.EyeControls3D(
+            position=(0.0, 0.6 * distance, 0.25 * distance),
+            look_target=(0.0, 0.04 * distance, distance),
+            eye_up=(0.0, 0.0, -1.0),
+        ),
+        line_grid=False,
+        background=(24, 26, 30),
+    )
