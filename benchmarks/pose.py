@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numba
 import numpy as np
-from pose_scenes import circles_in, frames, truth_of
+from pose_scenes import frames, true_circles
 
 from mushpipe import Circles
 from mushpipe.core.libraries import import_open3d
@@ -49,7 +49,7 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, help="folder that keeps rendered frames")
     options = parser.parse_args()
     frame = frames(SCENE, SEED, "a", 1, options.cache)[0]
-    found, _ = circles_in(truth_of(frame), SEED, False)
+    found, _ = true_circles(frame)
     rows = np.argsort(-found.radius, kind="stable")[: options.count]
     circles = Circles(found.center[rows], found.radius[rows], found.score[rows])
     fit, nearest, register = CapFit(depth_bias_mm=2.85), NearestDepth(), Registration()
