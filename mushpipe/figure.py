@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from itertools import islice
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -16,6 +17,8 @@ from mushpipe.core.types import Mask, Trace
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from mushpipe.stages.registration import Alignment
 
 T = TypeVar("T")
 GREEN, RED, BLUE, YELLOW = "#28c840", "#e02020", "#1440e0", "#ffd000"
@@ -95,6 +98,31 @@ def draw_diameter(trace: Trace) -> Figure:
     return _lay_out([Panel("diameter, mm", trace.frame.color, draw)], columns=1, scale=1.9)
 
 
+def draw_pose(trace: Trace, settings: Mapping[str, Any], most: int = 3) -> Figure:
+    """Draw the model (red) and the sample (blue) before and after registration, seen from the side.
+
+    Args:
+        trace: The frame.
+        settings: Of the stage `registration`, which is run anew on the best circles.
+        most: How many mushrooms.
+
+    Raises:
+        UsageError: The frame has no circles, no locations, or no mushroom with enough depth.
+        DependencyError: open3d or a library of the system is missing.
+    """
+    from mushpipe.stages.registration import Registration
+
+    circles, locations = _last(trace, Circles), _last(trace, Locations)
+    stage = Registration.model_validate(dict(settings))
+    best = np.argsort(-circles.score, kind="stable")
+    tries = (stage.align(trace.frame, circles, locations, int(row), 0) for row in best)
+    pairs = zip(best, tries, strict=True)
+    found = list(islice((pair for pair in pairs if pair[1] is not None), most))
+    if not found:
+        raise UsageError(f"frame {trace.frame.header.sequence}: no mushroom has enough depth")
+    return _lay_out_clouds([alignment for _, alignment in found if alignment is not None])
+
+
 KINDS: dict[str, Callable[[Trace], Figure]] = {
     "stages": draw_stages,
     "localization": draw_localization,
@@ -136,6 +164,32 @@ def _lay_out(panels: list[Panel], columns: int, scale: float = 1.0) -> Figure:
         panel.draw(axes)
     for axes in places:
         axes.set_axis_off()
+    return figure
+
+
+def _lay_out_clouds(alignments: list[Alignment]) -> Figure:
+    from matplotlib.figure import Figure
+
+    n = len(alignments)
+    figure = Figure(figsize=(0.75 * PANEL_IN * n, 1.5 * PANEL_IN), dpi=DPI, layout="constrained")
+    panels = figure.subplots(2, n, subplot_kw={"projection": "3d"}, squeeze=False)
+    for column, alignment in enumerate(alignments):
+        clouds = (alignment.before, alignment.after)
+        middle = alignment.sample.mean(axis=0)
+        reach = 1e3 * max(np.abs(cloud - middle).max() for cloud in clouds)
+        for row, (model, when) in enumerate(zip(clouds, ("before", "after"), strict=True)):
+            axes = panels[row, column]
+            for cloud, color in ((model, RED), (alignment.sample, BLUE)):
+                x, y, z = 1e3 * (cloud - middle).T
+                axes.scatter(x, y, z, s=3, color=color, depthshade=False)
+            # z of the optical frame points down, onto the bed
+            axes.set(xlim=(-reach, reach), ylim=(-reach, reach), zlim=(reach, -reach))
+            for name in "xyz":
+                getattr(axes, f"set_{name}label")(f"{name}, mm", fontsize=7, labelpad=-6)
+            axes.view_init(elev=12, azim=-60)
+            axes.tick_params(labelsize=6, pad=-3)
+            axes.set_box_aspect((1, 1, 1), zoom=0.95)
+            axes.set_title(f"({'ab'[row]}{column + 1}) {when}", fontsize=9)
     return figure
 
 

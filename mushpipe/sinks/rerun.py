@@ -95,7 +95,7 @@ class RerunSink(Sink):
             _check_reachable(self.connect)
             urls.append(self.connect)
         if self.spawn:
-            if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
+            if not has_display():
                 raise DependencyError(
                     "there is no display to open a viewer on: set 'save' to a file, or 'serve' to "
                     "a port and look from another machine"
@@ -134,7 +134,7 @@ class RerunSink(Sink):
         if self._layers is not None and (self._layers or not trace.durations_ns):
             return
         self._layers = layers_of(trace)
-        log_layers(self._recording, self._layers)
+        log_layers(self._recording, self._layers, [*trace.durations_ns])
         self._recording.send_blueprint(layout(self._layers, distance_of(trace.frame)))
 
     def _write_notes(self, rr: Any) -> None:
@@ -165,6 +165,11 @@ class RerunSink(Sink):
             os.killpg(self._server.pid, signal.SIGTERM)  # the command starts a child
             self._server.wait()
             self._server = None
+
+
+def has_display() -> bool:
+    """Return whether a viewer can open a window here."""
+    return sys.platform != "linux" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
 
 
 class _Notes(logging.Handler):

@@ -8,7 +8,7 @@ from typing import Any
 IMAGE = "camera/image"
 # layers of the image by what a stage puts out, in the order in which they are drawn
 FRAMES, INITIAL, MASKS = f"{IMAGE}/frames", f"{IMAGE}/initial", f"{IMAGE}/masks"
-CIRCLES, PICKS = f"{IMAGE}/circles", f"{IMAGE}/picks"
+CIRCLES, PICKS, IDS = f"{IMAGE}/circles", f"{IMAGE}/picks", f"{IMAGE}/ids"
 COLOR, DEPTH, HOLES = f"{IMAGE}/color", f"{IMAGE}/depth", f"{IMAGE}/holes"
 CLOUD, CAPS, AXES, TARGETS = "camera/cloud", "camera/caps", "camera/axes", "camera/picks"
 ORDER, WORKSPACE = "camera/order", "camera/workspace"
@@ -16,34 +16,30 @@ COUNTS, TIMES, VALIDITY, LOG = "plots/count", "plots/time", "plots/depth", "log"
 HIDDEN_AT_FIRST = (FRAMES, INITIAL, CIRCLES)
 
 
-def layout(layers: Sequence[str], distance: float) -> Any:
+def layout(layers: Sequence[str], distance: float | None) -> Any:
     """Return the blueprint of a run.
 
     Args:
         layers: Entities of the image that the run's stages fill, in drawing order. Of the masks
             the last is shown; every layer can be switched in the panel at the left.
-        distance: From the camera to the bed, m, for the first look from the side.
+        distance: From the camera to the bed, m, for the first look from the side; None where
+            there is no depth, and so nothing to show in space.
     """
     import rerun.blueprint as rrb
 
+    plots = [
+        rrb.TimeSeriesView(origin=COUNTS, name="Mushrooms"),
+        rrb.TimeSeriesView(origin=TIMES, name="Time per stage, ms"),
+    ]
+    right = [rrb.TextLogView(origin=LOG, name="Log")]
+    if distance is not None:
+        plots.append(rrb.TimeSeriesView(origin=VALIDITY, name="Depth valid, %"))
+        holes = rrb.Spatial2DView(origin=IMAGE, name="Depth, holes red", contents=[DEPTH, HOLES])
+        right = [_space_view(distance), holes, *right]
+    left = rrb.Vertical(_image_view(layers), rrb.Horizontal(*plots), row_shares=[3, 1])
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(
-                _image_view(layers),
-                rrb.Horizontal(
-                    rrb.TimeSeriesView(origin=COUNTS, name="Mushrooms"),
-                    rrb.TimeSeriesView(origin=TIMES, name="Time per stage, ms"),
-                    rrb.TimeSeriesView(origin=VALIDITY, name="Depth valid, %"),
-                ),
-                row_shares=[3, 1],
-            ),
-            rrb.Vertical(
-                _space_view(distance),
-                rrb.Spatial2DView(origin=IMAGE, name="Depth, holes red", contents=[DEPTH, HOLES]),
-                rrb.TextLogView(origin=LOG, name="Log"),
-                row_shares=[3, 2, 1],
-            ),
-            column_shares=[3, 2],
+            left, rrb.Vertical(*right, row_shares=[3, 2, 1][: len(right)]), column_shares=[3, 2]
         ),
         rrb.TimePanel(state="collapsed", timeline="frame"),
         rrb.SelectionPanel(state="collapsed"),

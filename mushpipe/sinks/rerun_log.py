@@ -17,6 +17,8 @@ FIRST = 20  # picks whose place in the order is written beside them
 CROWD = 40  # more mushrooms than this, and only their ids fit
 FULL_SIGMA = np.radians(20)  # tilt uncertainty that is drawn fully red
 _RED, _AMBER, _GREEN = (255, 70, 70), (255, 190, 40), (60, 220, 90)
+_WHEEL = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (213, 94, 0),
+          (204, 121, 167), (150, 150, 255), (190, 190, 190))  # fmt: skip
 _SOURCES = np.array([_RED, _GREEN, _AMBER], np.uint8)  # by DepthSource
 
 
@@ -51,22 +53,25 @@ def changed(trace: Trace) -> dict[str, RgbdFrame]:
     }
 
 
-def distance_of(frame: RgbdFrame) -> float:
-    """Return how far the bed is, m; half a metre where nobody knows."""
+def distance_of(frame: RgbdFrame) -> float | None:
+    """Return how far the bed is, m; None where there is no depth."""
     known = frame.depth_m[np.isfinite(frame.depth_m)]
-    return float(np.median(known)) if known.size else 0.5
+    return float(np.median(known)) if known.size else None
 
 
 def layers_of(trace: Trace) -> list[str]:
     """Return the layers of the image that this frame has, in drawing order."""
     circles = [f"{at.CIRCLES}/{stage}" for stage, _ in results(trace, Circles)]
-    picks = [at.PICKS] if any(results(trace, Picks)) else []
+    picks = [at.PICKS, at.IDS] if any(results(trace, Picks)) else []
     return [*changed(trace), *masks(trace), *circles, *picks]
 
 
-def log_layers(rec: Any, layers: Sequence[str]) -> None:
-    """Log the colours of masks, initial contours and holes."""
+def log_layers(rec: Any, layers: Sequence[str], stages: Sequence[str]) -> None:
+    """Log the colours of masks, initial contours, holes, and of the stages in the plot."""
     import rerun as rr
+
+    for number, stage in enumerate(stages):
+        _draw_series(rec, f"{at.TIMES}/{stage}", _WHEEL[number % len(_WHEEL)])
 
     styles = {
         at.MASKS: ("mushroom", (70, 150, 255, 255)),
@@ -88,13 +93,22 @@ def log_start(rec: Any, box: tuple[Any, Any] | None) -> None:
     rec.log("camera", rr.ViewCoordinates.RBD, static=True)
     names = {"found": (200, 200, 200), "located": _GREEN, "oriented": (80, 160, 255)}
     for name, color in names.items():
-        rec.log(f"{at.COUNTS}/{name}", rr.SeriesLines(colors=color, names=name), static=True)
+        _draw_series(rec, f"{at.COUNTS}/{name}", color)
+    _draw_series(rec, f"{at.VALIDITY}/valid", (255, 120, 200))
     if box is not None:
         low, high = np.array(box)
         shown = rr.Boxes3D(
             mins=[low], sizes=[high - low], colors=(255, 255, 255), labels=["workspace"]
         )
         rec.log(at.WORKSPACE, shown, static=True)
+
+
+def _draw_series(rec: Any, entity: str, color: tuple[int, int, int]) -> None:
+    """Draw a series as a line with dots, so that a single frame shows as well."""
+    import rerun as rr
+
+    rec.log(entity, rr.SeriesLines(colors=color), static=True)
+    rec.log(entity, rr.SeriesPoints(colors=color, marker_sizes=3), static=True)
 
 
 def log_images(rec: Any, trace: Trace, jpeg_quality: int, cloud_step: int) -> None:
@@ -179,7 +193,12 @@ def _log_picks(rec: Any, picks: Picks) -> None:
 
     n = len(picks)
     colors = _SOURCES[picks.source]
-    rec.log(at.PICKS, _rings(picks, colors=colors, labels=_labels(picks), show_labels=True))
+    rec.log(at.PICKS, _rings(picks, colors=colors))
+    labels = rr.Points2D(
+        picks.center, radii=0.5, colors=(255, 255, 255), labels=_labels(picks),
+        show_labels=True, draw_order=40,
+    )  # fmt: skip
+    rec.log(at.IDS, labels)
     best_first = np.argsort(-picks.score, kind="stable")
     located = best_first[picks.source[best_first] != DepthSource.MISSING]
     posed = located[np.isfinite(picks.axis[located, 0]) & np.isfinite(picks.diameter[located])]
@@ -224,8 +243,8 @@ def _labels(picks: Picks) -> list[str]:
     """Return per pick its id and, where there is room, its diameter."""
     if len(picks) > CROWD:
         return [str(i) for i in picks.id]
-    sizes = (f" {1000 * d:.0f} mm" if np.isfinite(d) else " size unknown" for d in picks.diameter)
-    return [f"{i}{size}" for i, size in zip(picks.id, sizes, strict=True)]
+    sizes = (f"{1000 * d:.0f} mm" if np.isfinite(d) else "size unknown" for d in picks.diameter)
+    return [f"{i}: {size}" for i, size in zip(picks.id, sizes, strict=True)]
 
 
 _WORDS = {

@@ -9,13 +9,21 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from mushpipe import Circles, DepthSource, Locations, Mask, Trace
+from mushpipe import Camera, Circles, DepthSource, Locations, Mask, Trace
 from mushpipe.cli import app
-from mushpipe.core.errors import UsageError
-from mushpipe.figure import BLUE, RED, draw_diameter, draw_localization, draw_stages
+from mushpipe.core.errors import DependencyError, UsageError
+from mushpipe.core.libraries import import_open3d
+from mushpipe.figure import BLUE, RED, draw_diameter, draw_localization, draw_pose, draw_stages
 from tests.io.values import make_frame, record, trace_of
 
 NAN = float("nan")
+
+try:
+    import_open3d()
+    reason = ""
+except DependencyError as error:
+    reason = str(error)
+needs_open3d = pytest.mark.skipif(bool(reason), reason=reason)
 
 
 def scene() -> Trace:
@@ -77,6 +85,49 @@ def test_diameters_stand_at_the_centres_and_unknown_ones_say_so() -> None:
     (axes,) = draw_diameter(scene()).axes
     assert texts(axes, RED) == ["41", "NaN"]
     assert [t.get_position() for t in axes.texts] == [(10, 5), (20, 12)]
+
+
+def dome() -> Trace:
+    """One mushroom, a half ball of 20 mm, in the middle of a small image at half a metre."""
+    camera = Camera(96, 72, 600.0, 600.0, 47.5, 35.5)
+    v, u = np.mgrid[:72, :96]
+    square = ((u - 47.5) / 600 * 0.5) ** 2 + ((v - 35.5) / 600 * 0.5) ** 2
+    depth = 0.5 - np.sqrt(np.maximum(0, 0.02**2 - square))
+    frame = make_frame(
+        color=np.full((72, 96, 3), 90, np.uint8),
+        depth=depth.astype(np.float32),
+        depth_scale=1.0,
+        camera=camera,
+    )
+    circles = Circles(np.array([[47.5, 35.5]]), np.array([24.0]), np.ones(1))
+    locations = Locations(
+        position=np.array([[0, 0, 0.48]]),
+        distance=np.array([0.48]),
+        diameter=np.array([0.04]),
+        source=np.array([DepthSource.MEASURED]),
+        sigma_position=np.full((1, 3), NAN),
+        sigma_diameter=np.full(1, NAN),
+    )
+    return trace_of(frame, detect=circles, locate=locations)
+
+
+@needs_open3d
+def test_pose_shows_the_model_before_and_after_beside_the_same_sample() -> None:
+    before, after = draw_pose(dome(), {"model": "cap", "global": "none", "up": (0, 0, -1)}).axes
+    (model, sample), (moved, same) = before.collections, after.collections
+    for a, b in zip(sample._offsets3d, same._offsets3d, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert any((a != b).any() for a, b in zip(model._offsets3d, moved._offsets3d, strict=True))
+    # Up in the picture is towards the camera: the smaller z.
+    low, high = before.get_zlim()
+    assert low > high
+    # The sample is the half ball, 40 mm across and at most 20 mm high.
+    x, y, z = (np.ptp(np.asarray(offsets)) for offsets in sample._offsets3d)
+    assert 35 < x < 41
+    assert 35 < y < 41
+    assert 10 < z < 21
+    with pytest.raises(UsageError, match="no mushroom has enough depth"):
+        draw_pose(dome(), {"min_points": 10_000})
 
 
 def test_what_is_missing_is_named(tmp_path: Path) -> None:
