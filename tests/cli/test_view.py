@@ -19,7 +19,7 @@ def entities(path: Path) -> dict[str, int]:
     rows: dict[str, int] = {}
     for chunk in RrdReader(path).stream():
         if not chunk.is_static:
-            rows[chunk.entity_path] = max(rows.get(chunk.entity_path, 0), chunk.num_rows)
+            rows[chunk.entity_path] = rows.get(chunk.entity_path, 0) + chunk.num_rows
     return rows
 
 
