@@ -8,18 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe import Camera, Circles, DepthSource, Header, Mask, PickFlag, Picks, RgbdFrame, Trace
+from mushpipe import Camera, Circles, Header, Mask, PickFlag, Picks, RgbdFrame, Trace
+from mushpipe.core.scene import CYAN, DOME, GREEN, SOURCE_COLORS, best_first, labels, posed, tints
 from mushpipe.sinks import rerun_layout as at
 
-# A pick does not carry the height of its dome; caps are drawn with this one, in radii.
-DOME = 0.6
 FIRST = 20  # picks whose place in the order is written beside them
-CROWD = 40  # more mushrooms than this, and only their ids fit
-FULL_SIGMA = np.radians(20)  # tilt uncertainty that is drawn fully red
-_RED, _AMBER, _GREEN = (255, 70, 70), (255, 190, 40), (60, 220, 90)
 _WHEEL = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (213, 94, 0),
           (204, 121, 167), (150, 150, 255), (190, 190, 190))  # fmt: skip
-_SOURCES = np.array([_RED, _GREEN, _AMBER], np.uint8)  # by DepthSource
 
 
 def results(trace: Trace, kind: type) -> Iterator[tuple[str, Any]]:
@@ -91,7 +86,7 @@ def log_start(rec: Any, box: tuple[Any, Any] | None) -> None:
 
     # Seen from above: x to the right, y (down in the image) towards the viewer, z down.
     rec.log("camera", rr.ViewCoordinates.RBD, static=True)
-    names = {"found": (200, 200, 200), "located": _GREEN, "oriented": (80, 160, 255)}
+    names = {"found": (200, 200, 200), "located": GREEN, "oriented": (80, 160, 255)}
     for name, color in names.items():
         _draw_series(rec, f"{at.COUNTS}/{name}", color)
     _draw_series(rec, f"{at.VALIDITY}/valid", (255, 120, 200))
@@ -173,7 +168,7 @@ def log_results(rec: Any, trace: Trace) -> None:
     import rerun as rr
 
     for stage, circles in results(trace, Circles):
-        rec.log(f"{at.CIRCLES}/{stage}", _rings(circles, colors=(0, 200, 255)))
+        rec.log(f"{at.CIRCLES}/{stage}", _rings(circles, colors=CYAN))
     for stage, duration in trace.durations_ns.items():
         rec.log(f"{at.TIMES}/{stage}", rr.Scalars(duration / 1e6))
     picks = next((value for _, value in reversed([*results(trace, Picks)])), None)
@@ -192,23 +187,22 @@ def _log_picks(rec: Any, picks: Picks) -> None:
     import rerun as rr
 
     n = len(picks)
-    colors = _SOURCES[picks.source]
+    colors = SOURCE_COLORS[picks.source]
     rec.log(at.PICKS, _rings(picks, colors=colors))
-    labels = rr.Points2D(
-        picks.center, radii=0.5, colors=(255, 255, 255), labels=_labels(picks),
+    ids = rr.Points2D(
+        picks.center, radii=0.5, colors=(255, 255, 255), labels=labels(picks),
         show_labels=True, draw_order=40,
     )  # fmt: skip
-    rec.log(at.IDS, labels)
-    best_first = np.argsort(-picks.score, kind="stable")
-    located = best_first[picks.source[best_first] != DepthSource.MISSING]
-    posed = located[np.isfinite(picks.axis[located, 0]) & np.isfinite(picks.diameter[located])]
+    rec.log(at.IDS, ids)
+    located = best_first(picks)
+    oriented = posed(picks, located)
     points = picks.position[located]
     rec.log(at.TARGETS, rr.Points3D(points, radii=0.002, colors=colors[located]))
     order = [f"{i + 1}" for i in range(min(len(located), FIRST))]
     first = rr.Points3D(points[:FIRST], radii=0.003, colors=(255, 255, 255), labels=order)
     rec.log(at.ORDER, first)
-    _log_caps(rec, picks, posed)
-    for name, count in (("found", n), ("located", len(located)), ("oriented", len(posed))):
+    _log_caps(rec, picks, oriented)
+    for name, count in (("found", n), ("located", len(located)), ("oriented", len(oriented))):
         rec.log(f"{at.COUNTS}/{name}", rr.Scalars(float(count)))
     text, level = _summary(picks)
     rec.log(at.LOG, rr.TextLog(text, level=level))
@@ -218,33 +212,17 @@ def _log_caps(rec: Any, picks: Picks, rows: NDArray[np.intp]) -> None:
     import rerun as rr
 
     radius, axis, apex = picks.diameter[rows] / 2, picks.axis[rows], picks.position[rows]
-    tints = _tints(picks.sigma_tilt[rows])
+    colors = tints(picks.sigma_tilt[rows])
     caps = rr.Ellipsoids3D(
         centers=apex - DOME * radius[:, None] * axis,
         half_sizes=radius[:, None] * (1, 1, DOME),
         quaternions=picks.quaternion[rows],
-        colors=np.column_stack([tints, np.full(len(rows), 90, np.uint8)]),
+        colors=np.column_stack([colors, np.full(len(rows), 90, np.uint8)]),
         fill_mode="solid",
     )
     rec.log(at.CAPS, caps)
-    arrows = rr.Arrows3D(origins=apex, vectors=radius[:, None] * axis, colors=tints, radii=0.0012)
+    arrows = rr.Arrows3D(origins=apex, vectors=radius[:, None] * axis, colors=colors, radii=0.0012)
     rec.log(at.AXES, arrows)
-
-
-def _tints(sigma: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Return (N, 3) colours: green is a certain tilt, red an uncertain one, grey an unknown one."""
-    share = np.clip(np.nan_to_num(sigma) / FULL_SIGMA, 0, 1)[:, None]
-    tints = (1 - share) * np.array(_GREEN) + share * np.array(_RED)
-    tints[np.isnan(sigma)] = 160
-    return np.asarray(tints, np.uint8)
-
-
-def _labels(picks: Picks) -> list[str]:
-    """Return per pick its id and, where there is room, its diameter."""
-    if len(picks) > CROWD:
-        return [str(i) for i in picks.id]
-    sizes = (f"{1000 * d:.0f} mm" if np.isfinite(d) else "size unknown" for d in picks.diameter)
-    return [f"{i}: {size}" for i, size in zip(picks.id, sizes, strict=True)]
 
 
 _WORDS = {
