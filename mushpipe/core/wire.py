@@ -25,6 +25,7 @@ DEPTH_TOPIC = "/camera/aligned_depth_to_color/image_raw"
 CAMERA_TOPIC = "/camera/color/camera_info"
 RESULT_PREFIX = "/mushpipe/"
 TIMING_TOPIC = "/mushpipe/timing"
+DRAWINGS = ("foxglove.ImageAnnotations", "foxglove.SceneUpdate")  # made of the tables beside them
 TABLES = {
     f"mushpipe.{cls.__name__}": cls
     for cls in (tables.Circles, tables.Locations, tables.Poses, tables.Picks, Truth)
