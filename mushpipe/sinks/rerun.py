@@ -59,7 +59,7 @@ class RerunSink(Sink):
     _notes: _Notes | None = PrivateAttr(None)
     _period_ns: int = PrivateAttr(0)
     _next_ns: int = PrivateAttr(0)
-    _layers: list[str] | None = PrivateAttr(None)
+    _shown: tuple[list[str], float | None] | None = PrivateAttr(None)
     _last: Header | None = PrivateAttr(None)
 
     def files(self, run: RunInfo) -> tuple[Path, ...]:
@@ -127,15 +127,18 @@ class RerunSink(Sink):
         self._write_notes(rr)
 
     def _lay_out(self, trace: Trace) -> None:
-        """Send the layout as soon as a frame has shown which layers there are."""
+        """Send the layout as soon as a frame shows which layers, and whether depth, there are."""
         from mushpipe.sinks.rerun_layout import layout
         from mushpipe.sinks.rerun_log import distance_of, layers_of, log_layers
 
-        if self._layers is not None and (self._layers or not trace.durations_ns):
+        if self._shown is not None and all(self._shown):
             return
-        self._layers = layers_of(trace)
-        log_layers(self._recording, self._layers, [*trace.durations_ns])
-        self._recording.send_blueprint(layout(self._layers, distance_of(trace.frame)))
+        before = self._shown or ([], None)
+        shown = (before[0] or layers_of(trace), before[1] or distance_of(trace.frame))
+        if shown != self._shown:
+            self._shown = shown
+            log_layers(self._recording, shown[0], [*trace.durations_ns])
+            self._recording.send_blueprint(layout(*shown))
 
     def _write_notes(self, rr: Any) -> None:
         while self._notes is not None and self._notes.waiting:

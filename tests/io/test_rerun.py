@@ -310,6 +310,27 @@ def test_the_file_has_one_layout_and_is_whole(tmp_path: Path) -> None:
     assert verified.returncode == 0, verified.stderr
 
 
+def test_the_layout_grows_when_depth_or_results_come_late(tmp_path: Path) -> None:
+    sent = []
+    sink = RerunSink(save=tmp_path / "out.rrd")
+    sink.open(RunInfo("bed", {}))
+    sink._recording.send_blueprint = lambda blueprint: sent.append(blueprint)
+    bare = Trace(make_frame(0, depth=None), {}, {})
+    full = trace_of(make_frame(2), a=make_picks())
+    for trace in (bare, bare, trace_of(make_frame(1)), full, full):
+        sink.consume(trace)
+    sink.close()
+    views = [{v.name for v in walk(b.root_container)} for b in sent]
+    assert views[0] == {"Image", "Mushrooms", "Time per stage, ms", "Log"}
+    assert views[1] == views[2] == views[0] | {"Bed", "Depth, holes red", "Depth valid, %"}
+
+
+def walk(part: Any) -> list[Any]:
+    """Return the views in a container of a blueprint."""
+    inside = getattr(part, "contents", [])
+    return [part] if not hasattr(part, "kind") else [v for p in inside for v in walk(p)]
+
+
 def free_port() -> int:
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))
