@@ -86,3 +86,9 @@ def test_links_to_files_of_the_repository_lead_somewhere() -> None:
         for target in re.findall(r"\]\(([^)#\s]+)", page.read_text()):
             if not target.startswith(("http", "reference/")):
                 assert (page.parent / target).exists(), f"{page}: {target}"
+
+
+def test_the_modules_that_the_page_on_the_paper_names_exist() -> None:
+    named = re.findall(r"`((?:stages|core|evaluate)/\w+\.py)", Path("docs/paper.md").read_text())
+    assert len(named) > 10
+    assert not [name for name in named if not (Path("mushpipe") / name).exists()]
