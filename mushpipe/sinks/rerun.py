@@ -222,7 +222,7 @@ def _start(host: str, port: int, *arguments: str) -> subprocess.Popen[bytes]:
         DependencyError: It does not come up.
     """
     if _answers(_reached_at(host), port):
-        raise UsageError(f"port {port} is taken")
+        raise UsageError(f"port {port} is taken: choose another, or end what listens there")
     server = subprocess.Popen(
         [sys.executable, "-m", "rerun", "--bind", host, "--port", str(port), *arguments],
         stdout=subprocess.DEVNULL,

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import re
 import runpy
+import shlex
 from pathlib import Path
 
 import pytest
 import yaml
+from typer.testing import CliRunner
 
 from mushpipe.builtin import mushpipe_register
+from mushpipe.cli import app
 from mushpipe.core.document import read_document
 from mushpipe.core.graph import compile_document
 from mushpipe.core.plugins import Registry, load_registry
@@ -79,6 +82,25 @@ def test_the_graph_and_the_segmenter_of_the_docs_work(tmp_path: Path) -> None:
     plan = compile_document(read_document(tmp_path / "graph.yaml"), load_registry())
     assert not plan.warnings
     assert type(plan.stages[0].plugin).__name__ == "Bright"
+
+
+def test_changed_settings_in_the_docs_are_accepted(tmp_path: Path) -> None:
+    """Commands with `--set` compile, but for those on files or devices of the reader."""
+    runs = [
+        shlex.split(line, comments=True)[1:]
+        for page in PAGES
+        for line in re.findall(r"^mushpipe run graphs.*--set.*", page.read_text(), re.MULTILINE)
+    ]
+    tried = [run for run in runs if "--source" not in run and run[1] != "graphs/live.yaml"]
+    assert len(tried) >= 5
+    (segmenter,) = re.findall(
+        r"```python\n(.*?)```", Path("docs/tutorial.md").read_text(), re.DOTALL
+    )
+    (tmp_path / "mine.py").write_text(segmenter)
+    for run in tried:
+        arguments = [word.replace("./mine.py", str(tmp_path / "mine.py")) for word in run[1:]]
+        result = CliRunner().invoke(app, ["validate", *arguments])
+        assert result.exit_code == 0, (run, result.exception)
 
 
 def test_links_to_files_of_the_repository_lead_somewhere() -> None:
