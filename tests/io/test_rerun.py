@@ -1,67 +1,19 @@
-"""What the sink `rerun` writes, read back by Rerun's own reader."""
+"""What the sink `rerun` shows of a frame, read back by Rerun's own reader."""
 
 from __future__ import annotations
 
 import logging
-import signal
-import socket
-import subprocess
-import sys
-import time
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-import pyarrow as pa
 import pytest
-from rerun.chunk import RrdReader
 
-from mushpipe import Circles, Mask, Picks, RunInfo, Trace
-from mushpipe.core.errors import DependencyError, UsageError
+from mushpipe import Circles, Mask, Picks, RunInfo
 from mushpipe.sinks.rerun import RerunSink
 from tests.io.bags import FX, FY, PERIOD, T0, depth_pixels
+from tests.io.rerun_file import IMAGE, read, show, unpack, values
 from tests.io.values import SIZE, make_circles, make_frame, make_picks, no_picks, trace_of
-
-IMAGE = "/camera/image"
-
-
-def feed(sink: RerunSink, traces: list[Trace], live: bool = False, graph: Any = None) -> None:
-    """Run the sink as the engine does."""
-    stages = {name: {} for trace in traces for name in trace.durations_ns}
-    sink.open(RunInfo("bed", {"graph": graph or {"stages": stages}}, live))
-    try:
-        for trace in traces:
-            sink.consume(trace)
-    finally:
-        sink.close()
-
-
-def show(
-    tmp_path: Path, traces: list[Trace], live: bool = False, graph: Any = None, **settings: Any
-) -> dict[str, Any]:
-    """Feed the sink and return what the file holds: columns by entity and component."""
-    feed(RerunSink(save=tmp_path / "out.rrd", **settings), traces, live, graph)
-    return read(tmp_path / "out.rrd")
-
-
-def read(path: Path) -> dict[str, Any]:
-    found: dict[str, dict[str, list[Any]]] = {}
-    for chunk in RrdReader(path).stream():
-        batch = chunk.to_record_batch()
-        columns = found.setdefault(chunk.entity_path, {})
-        for name in batch.schema.names:
-            column = batch.column(name)
-            if pa.types.is_timestamp(column.type):
-                column = column.cast(pa.int64())
-            columns.setdefault(name, []).extend(column.to_pylist())
-    return found
-
-
-def values(found: dict[str, Any], entity: str, component: str) -> list[Any]:
-    """Return one value per row of a column, whatever archetype it belongs to."""
-    (name,) = (n for n in found[entity] if n.endswith(f":{component}"))
-    return found[entity][name]
 
 
 def test_frames_stand_on_two_timelines(tmp_path: Path) -> None:
@@ -156,10 +108,6 @@ def test_a_frame_that_a_stage_changed_has_its_layer(tmp_path: Path) -> None:
     decoded = cv2.imdecode(np.array(data, np.uint8), cv2.IMREAD_COLOR)
     assert np.abs(decoded.astype(int) - 90).max() <= 2
     assert f"{IMAGE}/frames/correct" not in found  # only its depth is another
-
-
-def unpack(color: int) -> tuple[int, int, int]:
-    return (color >> 24 & 255, color >> 16 & 255, color >> 8 & 255)
 
 
 def test_picks_carry_the_place_size_label_and_colour(tmp_path: Path) -> None:
@@ -297,110 +245,3 @@ def test_the_workspace_of_a_robot_in_the_cameras_frame_is_drawn(tmp_path: Path) 
     np.testing.assert_allclose(sizes, [[[0.2, 0.1, 0.2]]], rtol=1e-6)
     mounted = {"sinks": {"robot": {"workspace": box, "mount": {"frame": "base"}}}}
     assert "/camera/workspace" not in show(tmp_path, [trace_of(make_frame())], graph=mounted)
-
-
-def test_the_file_has_one_layout_and_is_whole(tmp_path: Path) -> None:
-    mask = Mask(np.zeros((24, 32), bool))
-    show(tmp_path, [trace_of(make_frame(), segment=mask, pick=make_picks())])
-    reader = RrdReader(tmp_path / "out.rrd")
-    assert len(reader.recordings()) == 1
-    assert len(reader.blueprints()) == 1
-    command = [sys.executable, "-m", "rerun", "rrd", "verify", str(tmp_path / "out.rrd")]
-    verified = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert verified.returncode == 0, verified.stderr
-
-
-def test_the_layout_grows_when_depth_or_results_come_late(tmp_path: Path) -> None:
-    sent = []
-    sink = RerunSink(save=tmp_path / "out.rrd")
-    sink.open(RunInfo("bed", {}))
-    sink._recording.send_blueprint = lambda blueprint: sent.append(blueprint)
-    bare = Trace(make_frame(0, depth=None), {}, {})
-    full = trace_of(make_frame(2), a=make_picks())
-    for trace in (bare, bare, trace_of(make_frame(1)), full, full):
-        sink.consume(trace)
-    sink.close()
-    views = [{v.name for v in walk(b.root_container)} for b in sent]
-    assert views[0] == {"Image", "Mushrooms", "Time per stage, ms", "Log"}
-    assert views[1] == views[2] == views[0] | {"Bed", "Depth, holes red", "Depth valid, %"}
-
-
-def walk(part: Any) -> list[Any]:
-    """Return the views in a container of a blueprint."""
-    inside = getattr(part, "contents", [])
-    return [part] if not hasattr(part, "kind") else [v for p in inside for v in walk(p)]
-
-
-def free_port() -> int:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return int(s.getsockname()[1])
-
-
-def test_a_run_is_served_to_viewers_on_this_machine_only(tmp_path: Path) -> None:
-    port = free_port()
-    sink = RerunSink(serve=port, save=tmp_path / "out.rrd")
-    sink.open(RunInfo("bed", {}))
-    listening = Path("/proc/net/tcp").read_text()
-    sink.consume(trace_of(make_frame(), pick=make_picks()))
-    sink.close()
-    assert f"0100007F:{port:04X} 00000000:0000 0A" in listening
-    assert f"00000000:{port:04X}" not in listening
-    assert (tmp_path / "out.rrd").stat().st_size > 0
-    wait_for(port, False)
-
-
-def test_what_is_sent_to_a_viewer_arrives(tmp_path: Path) -> None:
-    port = free_port()
-    stored = tmp_path / "arrived.rrd"
-    # Rerun's own command line plays the viewer that receives.
-    command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--port", str(port)]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    viewer = subprocess.Popen([*command, "--save", str(stored)], **quiet)
-    try:
-        wait_for(port)
-        feed(
-            RerunSink(connect=f"rerun+http://127.0.0.1:{port}/proxy"),
-            [trace_of(make_frame(), pick=make_picks())],
-        )
-        viewer.send_signal(signal.SIGINT)
-        viewer.wait(20)
-    finally:
-        viewer.kill()
-    assert "/camera/image/picks" in {c.entity_path for c in RrdReader(stored).stream()}
-
-
-def wait_for(port: int, listening: bool = True) -> None:
-    for _ in range(200):
-        with socket.socket() as probe:
-            if (probe.connect_ex(("127.0.0.1", port)) == 0) == listening:
-                return
-        time.sleep(0.1)
-    raise TimeoutError(port)
-
-
-def test_what_cannot_be_opened_is_refused_with_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(UsageError, match="set 'save', 'spawn', 'connect' or 'serve'"):
-        feed(RerunSink(), [])
-    with pytest.raises(UsageError, match="no viewer answers at 127"):
-        feed(RerunSink(connect=f"rerun+http://127.0.0.1:{free_port()}/proxy"), [])
-    with pytest.raises(UsageError, match="is not like"):
-        feed(RerunSink(connect="localhost"), [])
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    with pytest.raises(DependencyError, match="no display"):
-        feed(RerunSink(spawn=True), [])
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        sink = RerunSink(serve=taken.getsockname()[1])
-        with pytest.raises(UsageError, match="is taken"):
-            feed(sink, [])
-
-
-def test_it_takes_only_the_newest_frame_when_live_and_can_be_closed_twice(tmp_path: Path) -> None:
-    sink = RerunSink(save=tmp_path / "{recording}.rrd")
-    assert sink.delivery == "latest"
-    feed(sink, [trace_of(make_frame())])
-    sink.close()
-    assert (tmp_path / "bed.rrd").stat().st_size > 0
