@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
 import subprocess
@@ -16,6 +17,7 @@ from rerun.chunk import RrdReader
 
 from mushpipe import Mask, RunInfo, Trace
 from mushpipe.core.errors import DependencyError, UsageError
+from mushpipe.sinks import rerun
 from mushpipe.sinks.rerun import RerunSink
 from tests.io.rerun_file import feed, show
 from tests.io.values import make_frame, make_picks, trace_of
@@ -89,6 +91,31 @@ def test_what_is_sent_to_a_viewer_arrives(tmp_path: Path) -> None:
         viewer.wait(20)
     finally:
         viewer.kill()
+    assert "/camera/image/picks" in {c.entity_path for c in RrdReader(stored).stream()}
+
+
+def test_a_viewer_is_opened_for_this_machine_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started, stored, start = [], tmp_path / "shown.rrd", rerun._start
+
+    def instead(host: str, port: int, *arguments: str) -> subprocess.Popen[bytes]:
+        started.append((host, arguments, start(host, port, "--save", str(stored))))
+        return started[0][2]
+
+    monkeypatch.setenv("DISPLAY", ":99")
+    monkeypatch.setattr(rerun, "PORT", free_port())
+    monkeypatch.setattr(rerun, "_start", instead)
+    try:
+        for _ in range(2):  # the viewer of the first run takes the second one too
+            feed(RerunSink(spawn=True, memory="300MB"), [trace_of(make_frame(), pick=make_picks())])
+        ((host, arguments, viewer),) = started
+        assert (host, arguments) == ("127.0.0.1", ("--memory-limit", "300MB"))
+        assert viewer.poll() is None  # it stays open when the run is over
+    finally:
+        for _, _, viewer in started:
+            os.killpg(viewer.pid, signal.SIGINT)
+            viewer.wait(20)
     assert "/camera/image/picks" in {c.entity_path for c in RrdReader(stored).stream()}
 
 
