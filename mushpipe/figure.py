@@ -179,9 +179,12 @@ def _lay_out_clouds(alignments: list[Alignment]) -> Figure:
         reach = 1e3 * max(np.abs(cloud - middle).max() for cloud in clouds)
         for row, (model, when) in enumerate(zip(clouds, ("before", "after"), strict=True)):
             axes = panels[row, column]
-            for cloud, color in ((model, RED), (alignment.sample, BLUE)):
+            for cloud, color, size, alpha in (
+                (model, RED, 2, 0.35),
+                (alignment.sample, BLUE, 5, 1.0),
+            ):
                 x, y, z = 1e3 * (cloud - middle).T
-                axes.scatter(x, y, z, s=3, color=color, depthshade=False)
+                axes.scatter(x, y, z, s=size, color=color, alpha=alpha, depthshade=False)
             # z of the optical frame points down, onto the bed
             axes.set(xlim=(-reach, reach), ylim=(-reach, reach), zlim=(reach, -reach))
             for name in "xyz":
