@@ -4,7 +4,7 @@ from pathlib import Path
 
 import foxglove.layouts as fl
 
-STAGES = ("flatten", "segment", "open", "detect", "pose", "pick")
+STAGES = ("correct", "flatten", "segment", "open", "detect", "pose", "pick")
 
 
 def layout() -> fl.Layout:

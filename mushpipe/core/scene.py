@@ -20,10 +20,9 @@ RED, AMBER, GREEN, CYAN = (255, 70, 70), (255, 190, 40), (60, 220, 90), (0, 200,
 SOURCE_COLORS = np.array([RED, GREEN, AMBER], np.uint8)  # by DepthSource
 
 
-def best_first(picks: Picks) -> NDArray[np.intp]:
-    """Return the rows of the picks that have a position, the most certain first."""
-    rows = np.argsort(-picks.score, kind="stable")
-    return np.asarray(rows[picks.source[rows] != DepthSource.MISSING])
+def in_order(picks: Picks) -> NDArray[np.intp]:
+    """Return the rows of the picks that have a position, in the order in which to pick."""
+    return np.flatnonzero(picks.source != DepthSource.MISSING)
 
 
 def posed(picks: Picks, rows: NDArray[np.intp]) -> NDArray[np.intp]:
@@ -99,7 +98,7 @@ def scene_update(picks: Picks, header: Header) -> bytes:
     """
     from foxglove.messages import SceneEntity, SceneUpdate
 
-    rows = best_first(picks)
+    rows = in_order(picks)
     caps = posed(picks, rows)
     entity = SceneEntity(
         timestamp=timestamp(header.stamp_ns),

@@ -18,6 +18,7 @@ from pydantic import Field, PrivateAttr
 
 from mushpipe import GraphPath, Header, RunInfo, Sink, Trace
 from mushpipe.core.errors import DependencyError, UsageError
+from mushpipe.core.transform import Transform
 
 logger = logging.getLogger("mushpipe")
 PORT = 9876  # the SDK's own default
@@ -61,6 +62,7 @@ class RerunSink(Sink):
     _next_ns: int = PrivateAttr(0)
     _shown: tuple[list[str], float | None] | None = PrivateAttr(None)
     _last: Header | None = PrivateAttr(None)
+    _base: Transform | None = PrivateAttr(None)
 
     def files(self, run: RunInfo) -> tuple[Path, ...]:
         """Return the file it writes."""
@@ -83,7 +85,9 @@ class RerunSink(Sink):
             raise UsageError("nothing to do: set 'save', 'spawn', 'connect' or 'serve'")
         self._recording = rr.RecordingStream("mushpipe", recording_id=run.recording)
         self._recording.set_sinks(*sinks)
-        log_start(self._recording, _workspace(run.manifest.get("graph", {})))
+        graph = run.manifest.get("graph", {})
+        self._base = _base(graph)
+        log_start(self._recording, _workspace(graph), self._base)
         self._period_ns = round(1e9 / self.image_hz) if run.live else 0
         self._notes = _Notes()
         logger.addHandler(self._notes)
@@ -123,7 +127,7 @@ class RerunSink(Sink):
         if header.stamp_ns >= self._next_ns or not self._period_ns:
             self._next_ns = header.stamp_ns + self._period_ns
             rerun_log.log_images(rec, trace, self.jpeg_quality, self.cloud_step)
-        rerun_log.log_results(rec, trace)
+        rerun_log.log_results(rec, trace, self._base)
         self._write_notes(rr)
 
     def _lay_out(self, trace: Trace) -> None:
@@ -187,11 +191,18 @@ class _Notes(logging.Handler):
 
 
 def _workspace(graph: Any) -> tuple[Any, Any] | None:
-    """Return the corners of the workspace that a robot's sink states in the camera's frame."""
+    """Return the corners of a robot's workspace, which is in the frame of the picks."""
     for sink in graph.get("sinks", {}).values():
-        if sink.get("workspace") and not sink.get("mount"):
+        if sink.get("workspace"):
             return sink["workspace"]["low"], sink["workspace"]["high"]
     return None
+
+
+def _base(graph: Any) -> Transform | None:
+    """Return the pose of the camera in the robot's frame, where picks are given in that."""
+    stated = [stage.get("T_base_camera") for stage in graph.get("stages", {}).values()]
+    known = [Transform.model_validate(each) for each in stated if each]
+    return known[-1] if known else None
 
 
 def _reached_at(host: str) -> str:

@@ -10,8 +10,9 @@ IMAGE = "camera/image"
 FRAMES, INITIAL, MASKS = f"{IMAGE}/frames", f"{IMAGE}/initial", f"{IMAGE}/masks"
 CIRCLES, PICKS, IDS = f"{IMAGE}/circles", f"{IMAGE}/picks", f"{IMAGE}/ids"
 COLOR, DEPTH, HOLES = f"{IMAGE}/color", f"{IMAGE}/depth", f"{IMAGE}/holes"
-CLOUD, CAPS, AXES, TARGETS = "camera/cloud", "camera/caps", "camera/axes", "camera/picks"
-ORDER, WORKSPACE = "camera/order", "camera/workspace"
+CLOUD, BASE = "camera/cloud", "camera/base"
+# in space, below the camera or below the robot's base, by the frame of the picks
+SPACE = CAPS, AXES, TARGETS, ORDER, WORKSPACE = "caps", "axes", "picks", "order", "workspace"
 COUNTS, TIMES, VALIDITY, LOG = "plots/count", "plots/time", "plots/depth", "log"
 HIDDEN_AT_FIRST = (FRAMES, INITIAL, CIRCLES)
 
@@ -68,7 +69,7 @@ def _space_view(distance: float) -> Any:
     return rrb.Spatial3DView(
         origin="camera",
         name="Bed",
-        contents=[IMAGE, CLOUD, CAPS, AXES, TARGETS, ORDER, WORKSPACE],
+        contents=[IMAGE, CLOUD, *(f"camera/{name}" for name in SPACE), f"{BASE}/**"],
         eye_controls=rrb.EyeControls3D(
             position=(0.0, 0.6 * distance, 0.25 * distance),
             look_target=(0.0, 0.04 * distance, distance),

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe import Camera, Circles, Header, Mask, PickFlag, Picks, RgbdFrame, Trace
-from mushpipe.core.scene import CYAN, DOME, GREEN, SOURCE_COLORS, best_first, labels, posed, tints
+from mushpipe.core.scene import CYAN, DOME, GREEN, SOURCE_COLORS, in_order, labels, posed, tints
+from mushpipe.core.transform import Transform
 from mushpipe.sinks import rerun_layout as at
 
 FIRST = 20  # picks whose place in the order is written beside them
@@ -80,8 +81,8 @@ def log_layers(rec: Any, layers: Sequence[str], stages: Sequence[str]) -> None:
                 rec.log(entity, context, static=True)
 
 
-def log_start(rec: Any, box: tuple[Any, Any] | None) -> None:
-    """Log what holds for the whole run: directions, names, the workspace's corners (m)."""
+def log_start(rec: Any, box: tuple[Any, Any] | None, base: Transform | None) -> None:
+    """Log what holds for the whole run: directions, names, workspace (m), T_base_camera."""
     import rerun as rr
 
     # Seen from above: x to the right, y (down in the image) towards the viewer, z down.
@@ -95,7 +96,14 @@ def log_start(rec: Any, box: tuple[Any, Any] | None) -> None:
         shown = rr.Boxes3D(
             mins=[low], sizes=[high - low], colors=(255, 255, 255), labels=["workspace"]
         )
-        rec.log(at.WORKSPACE, shown, static=True)
+        rec.log(f"{'camera' if base is None else at.BASE}/{at.WORKSPACE}", shown, static=True)
+    if base is not None:  # T_base_camera takes what is below the camera to what is below the base
+        pose = rr.Transform3D(
+            translation=base.translation,
+            quaternion=rr.Quaternion(xyzw=base.quaternion),
+            relation=rr.TransformRelation.ChildFromParent,
+        )
+        rec.log(at.BASE, pose, static=True)
 
 
 def _draw_series(rec: Any, entity: str, color: tuple[int, int, int]) -> None:
@@ -163,7 +171,7 @@ def _log_cloud(rec: Any, frame: RgbdFrame, camera: Camera, step: int) -> None:
     rec.log(at.CLOUD, rr.Points3D(points, colors=frame.color[every][known], radii=radii))
 
 
-def log_results(rec: Any, trace: Trace) -> None:
+def log_results(rec: Any, trace: Trace, base: Transform | None) -> None:
     """Log circles, picks in the image and in space, counts, times, and the frame's warnings."""
     import rerun as rr
 
@@ -174,6 +182,10 @@ def log_results(rec: Any, trace: Trace) -> None:
     picks = next((value for _, value in reversed([*results(trace, Picks)])), None)
     if picks is not None:
         _log_picks(rec, picks)
+        if picks.frame_id in ("", trace.frame.header.frame_id):
+            _log_space(rec, picks, "camera")
+        elif base is not None and picks.frame_id == base.frame:
+            _log_space(rec, picks, at.BASE)  # elsewhere nobody knows how they lie to the camera
 
 
 def _rings(table: Circles | Picks, **style: Any) -> Any:
@@ -186,29 +198,34 @@ def _rings(table: Circles | Picks, **style: Any) -> Any:
 def _log_picks(rec: Any, picks: Picks) -> None:
     import rerun as rr
 
-    n = len(picks)
-    colors = SOURCE_COLORS[picks.source]
-    rec.log(at.PICKS, _rings(picks, colors=colors))
+    rec.log(at.PICKS, _rings(picks, colors=SOURCE_COLORS[picks.source]))
     ids = rr.Points2D(
         picks.center, radii=0.5, colors=(255, 255, 255), labels=labels(picks),
         show_labels=True, draw_order=40,
     )  # fmt: skip
     rec.log(at.IDS, ids)
-    located = best_first(picks)
-    oriented = posed(picks, located)
-    points = picks.position[located]
-    rec.log(at.TARGETS, rr.Points3D(points, radii=0.002, colors=colors[located]))
-    order = [f"{i + 1}" for i in range(min(len(located), FIRST))]
-    first = rr.Points3D(points[:FIRST], radii=0.003, colors=(255, 255, 255), labels=order)
-    rec.log(at.ORDER, first)
-    _log_caps(rec, picks, oriented)
-    for name, count in (("found", n), ("located", len(located)), ("oriented", len(oriented))):
+    located = in_order(picks)
+    counts = {"found": len(picks), "located": len(located), "oriented": len(posed(picks, located))}
+    for name, count in counts.items():
         rec.log(f"{at.COUNTS}/{name}", rr.Scalars(float(count)))
     text, level = _summary(picks)
     rec.log(at.LOG, rr.TextLog(text, level=level))
 
 
-def _log_caps(rec: Any, picks: Picks, rows: NDArray[np.intp]) -> None:
+def _log_space(rec: Any, picks: Picks, place: str) -> None:
+    """Log picks, their order and their caps below the entity whose frame they are in."""
+    import rerun as rr
+
+    located = in_order(picks)
+    points, colors = picks.position[located], SOURCE_COLORS[picks.source[located]]
+    rec.log(f"{place}/{at.TARGETS}", rr.Points3D(points, radii=0.002, colors=colors))
+    order = [f"{i + 1}" for i in range(min(len(located), FIRST))]
+    first = rr.Points3D(points[:FIRST], radii=0.003, colors=(255, 255, 255), labels=order)
+    rec.log(f"{place}/{at.ORDER}", first)
+    _log_caps(rec, picks, posed(picks, located), place)
+
+
+def _log_caps(rec: Any, picks: Picks, rows: NDArray[np.intp], place: str) -> None:
     import rerun as rr
 
     radius, axis, apex = picks.diameter[rows] / 2, picks.axis[rows], picks.position[rows]
@@ -220,9 +237,9 @@ def _log_caps(rec: Any, picks: Picks, rows: NDArray[np.intp]) -> None:
         colors=np.column_stack([colors, np.full(len(rows), 90, np.uint8)]),
         fill_mode="solid",
     )
-    rec.log(at.CAPS, caps)
+    rec.log(f"{place}/{at.CAPS}", caps)
     arrows = rr.Arrows3D(origins=apex, vectors=radius[:, None] * axis, colors=colors, radii=0.0012)
-    rec.log(at.AXES, arrows)
+    rec.log(f"{place}/{at.AXES}", arrows)
 
 
 _WORDS = {
@@ -230,6 +247,9 @@ _WORDS = {
     PickFlag.DEPTH_ESTIMATED: "with estimated depth",
     PickFlag.POSE_UNKNOWN: "without pose",
     PickFlag.AT_BORDER: "at the border",
+    PickFlag.OCCLUDED: "partly hidden",
+    PickFlag.TILT_UNOBSERVABLE: "with an unsure tilt",
+    PickFlag.TOO_CLOSE_TO_NEIGHBOUR: "too close to a neighbour",
 }
 
 

@@ -41,7 +41,7 @@ def decoded(path: Path) -> dict[str, list[Any]]:
 
 
 def leaning() -> Picks:
-    """Three picks: one leans by 30 degrees, one is upright and better, one has no pose."""
+    """Three picks: one leans by 30 degrees, one is upright, one has no pose."""
     axes = np.array([[0.5, 0, -np.sqrt(0.75)], [0, 0, -1.0], [NAN] * 3])
     turns = [Rotation.align_vectors(axis[None], [[0, 0, 1.0]])[0] for axis in axes[:2]]
     position = np.array([[0.1, 0.2, 0.5], [0, 0, 0.6], [0.05, 0, 0.6]])
@@ -50,6 +50,7 @@ def leaning() -> Picks:
         center=np.array([[10.0, 5.0], [20.0, 12.0], [3.0, 3.0]]),
         radius=np.array([3.0, 4.0, 5.0]),
         position=position,
+        surface=position,
         distance=np.linalg.norm(position, axis=1),
         diameter=np.array([0.04, 0.05, 0.03]),
         quaternion=np.array([*(turn.as_quat() for turn in turns), [NAN] * 4]),
@@ -91,7 +92,7 @@ def test_caps_axes_and_order_stand_in_the_scene(tmp_path: Path) -> None:
     topics = decoded(record(tmp_path / "out.mcap", [trace_of(make_frame(), pick=picks)]))
     (entity,) = topics["/mushpipe/pick/scene"][0].entities
     assert (entity.frame_id, entity.id) == ("optical", "picks")
-    for row, sphere, arrow in zip([1, 0], entity.spheres, entity.arrows, strict=True):
+    for row, sphere, arrow in zip([0, 1], entity.spheres, entity.arrows, strict=True):
         half = np.array(xyz(sphere.size)) / 2
         top = np.array(xyz(sphere.pose.position)) + turn(sphere.pose.orientation).apply(
             [0, 0, half[2]]
@@ -103,13 +104,13 @@ def test_caps_axes_and_order_stand_in_the_scene(tmp_path: Path) -> None:
         # An arrow of Foxglove's points along +x.
         pointing = turn(arrow.pose.orientation).apply([1, 0, 0])
         np.testing.assert_allclose(pointing, picks.axis[row], atol=1e-12)
-    certain, uncertain = (arrow.color for arrow in entity.arrows)
+    uncertain, certain = (arrow.color for arrow in entity.arrows)
     assert certain.g > certain.r
     assert uncertain.r > uncertain.g
     places = {text.text: xyz(text.pose.position) for text in entity.texts}
     assert {rank: places[rank] for rank in "123"} == {
-        "1": list(picks.position[1]),
-        "2": list(picks.position[0]),
+        "1": list(picks.position[0]),
+        "2": list(picks.position[1]),
         "3": list(picks.position[2]),
     }
 

@@ -8,10 +8,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mushpipe import Circles, Mask, Picks, RunInfo
 from mushpipe.sinks.rerun import RerunSink
-from tests.io.bags import FX, FY, PERIOD, T0, depth_pixels
+from tests.io.bags import FX, FY, OPTICAL, PERIOD, T0, depth_pixels
 from tests.io.rerun_file import IMAGE, read, show, unpack, values
 from tests.io.values import SIZE, make_circles, make_frame, make_picks, no_picks, trace_of
 
@@ -129,8 +130,8 @@ def test_picks_carry_the_place_size_label_and_colour(tmp_path: Path) -> None:
     assert values(found, "/camera/order", "labels") == [["1"]]
 
 
-def many(n: int) -> Picks:
-    """Make picks in a row, 5 cm apart; the last is the best, and each leans more."""
+def many(n: int, frame_id: str = OPTICAL) -> Picks:
+    """Make picks in a row, 5 cm apart; each leans more."""
     tilt = np.linspace(0, 0.5, n)
     axis = np.column_stack([np.sin(tilt), np.zeros(n), -np.cos(tilt)])
     x = np.arange(n) * 0.05
@@ -141,6 +142,7 @@ def many(n: int) -> Picks:
         center=np.column_stack([x, x]),
         radius=np.full(n, 3.0),
         position=np.column_stack([x, 0 * x, 0 * x + 0.5]),
+        surface=np.column_stack([x, 0 * x, 0 * x + 0.5]),
         distance=np.hypot(x, 0.5),
         diameter=np.full(n, 0.04),
         quaternion=half,
@@ -151,25 +153,24 @@ def many(n: int) -> Picks:
         sigma_tilt=np.linspace(0, np.radians(20), n),
         source=np.ones(n, np.uint8),
         flags=np.zeros(n, np.uint32),
-        frame_id="camera",
+        frame_id=frame_id,
     )
 
 
 def test_caps_and_axes_stand_where_the_picks_say(tmp_path: Path) -> None:
     picks = many(5)
     found = show(tmp_path, [trace_of(make_frame(), pick=picks)])
-    best_first = np.arange(5)[::-1]
     (origins,), (vectors,) = (values(found, "/camera/axes", n) for n in ("origins", "vectors"))
-    np.testing.assert_allclose(origins, picks.position[best_first], atol=1e-6)
-    np.testing.assert_allclose(vectors, 0.02 * picks.axis[best_first], atol=1e-6)
+    np.testing.assert_allclose(origins, picks.position, atol=1e-6)
+    np.testing.assert_allclose(vectors, 0.02 * picks.axis, atol=1e-6)
     (centers,), (sizes,) = (values(found, "/camera/caps", n) for n in ("centers", "half_sizes"))
     # The top of each ellipsoid along its own axis is the apex, its width the diameter.
-    tops = np.array(centers) + np.array(sizes)[:, 2:] * picks.axis[best_first]
-    np.testing.assert_allclose(tops, picks.position[best_first], atol=1e-6)
+    tops = np.array(centers) + np.array(sizes)[:, 2:] * picks.axis
+    np.testing.assert_allclose(tops, picks.position, atol=1e-6)
     np.testing.assert_allclose(np.array(sizes)[:, :2], 0.02, rtol=1e-6)
     colors = np.array([unpack(c) for c in values(found, "/camera/axes", "colors")[0]])
-    assert (np.diff(colors[:, 0]) < 0).all()  # the most uncertain first: red fades
-    assert (np.diff(colors[:, 1]) > 0).all()
+    assert (np.diff(colors[:, 0]) > 0).all()  # the more uncertain, the redder
+    assert (np.diff(colors[:, 1]) < 0).all()
     assert all(c & 255 < 128 for c in values(found, "/camera/caps", "colors")[0])  # translucent
     assert values(found, "/camera/order", "labels") == [["1", "2", "3", "4", "5"]]
 
@@ -243,5 +244,30 @@ def test_the_workspace_of_a_robot_in_the_cameras_frame_is_drawn(tmp_path: Path) 
     np.testing.assert_allclose(values(found, "/camera/workspace", "centers"), [[[0, 0, 0.5]]])
     sizes = values(found, "/camera/workspace", "half_sizes")
     np.testing.assert_allclose(sizes, [[[0.2, 0.1, 0.2]]], rtol=1e-6)
-    mounted = {"sinks": {"robot": {"workspace": box, "mount": {"frame": "base"}}}}
-    assert "/camera/workspace" not in show(tmp_path, [trace_of(make_frame())], graph=mounted)
+
+
+def test_picks_in_the_robots_frame_stand_below_its_base(tmp_path: Path) -> None:
+    """What Rerun makes of the transform is p_base = T_base_camera p_camera."""
+    turn = Rotation.from_euler("xyz", [180, 10, 30], degrees=True)
+    stated = {"frame": "base", "translation": [0.4, -0.1, 0.9], "quaternion": [*turn.as_quat()]}
+    box = {"low": [-0.2, -0.1, 0.3], "high": [0.2, 0.1, 0.7]}
+    graph = {
+        "stages": {"pick": {"T_base_camera": stated}},
+        "sinks": {"robot": {"workspace": box}},
+    }
+    found = show(tmp_path, [trace_of(make_frame(), pick=many(3, "base"))], graph=graph)
+    for name in ("picks", "order", "caps", "axes", "workspace"):
+        assert f"/camera/base/{name}" in found
+        assert f"/camera/{name}" not in found
+    assert values(found, "/camera/base", "relation") == [[2]]  # child from parent
+    (((qx, qy, qz, qw),),) = values(found, "/camera/base", "quaternion")
+    np.testing.assert_allclose(
+        Rotation.from_quat([qx, qy, qz, qw]).as_matrix(), turn.as_matrix(), atol=1e-6
+    )
+    np.testing.assert_allclose(values(found, "/camera/base", "translation"), [[[0.4, -0.1, 0.9]]])
+
+
+def test_picks_in_a_frame_that_nobody_placed_are_not_drawn_in_space(tmp_path: Path) -> None:
+    found = show(tmp_path, [trace_of(make_frame(), pick=many(3, "elsewhere"))])
+    assert len(values(found, f"{IMAGE}/picks", "centers")[0]) == 3
+    assert not [entity for entity in found if entity.endswith(("/caps", "/axes", "/order"))]
