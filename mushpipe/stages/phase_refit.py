@@ -20,9 +20,11 @@ from mushpipe.stages.phase_steps import rise, step_up
 Shape = NDArray[np.float64]
 Table = NDArray[np.float64]
 DIRECTIONS = 96
-ROUNDS = 3
-REACH = 0.28  # of the radius: how far from the candidate edge points are looked for
-OVAL = 0.06  # of the radius: expected size of p and q
+# A wide fit, then a narrow one to the edge points around what it found; both of the radius.
+REACH = (0.4, 0.2)  # how far from the outline edge points are looked for
+SCALES = ((0.25, 0.14), (0.09, 0.05))  # the residual at which a weight has fallen to a quarter
+WIDE, NARROW = 0, 1
+OVAL = 0.12  # of the radius: expected size of p and q
 TURNED = 0.7  # cosine between an edge's normal and the radius
 ALIGNED = 0.8
 PER_DIRECTION = 3
@@ -54,7 +56,9 @@ def tolerance(radius: float) -> float:
 
 
 @jit
-def gather(edges: Edges, height: Plane, step: float, shape: Shape, coarse: int, rows: Rows) -> int:
+def gather(
+    edges: Edges, height: Plane, step: float, shape: Shape, stage: int, coarse: int, rows: Rows
+) -> int:
     """Write the rows of edge points around an outline that face its centre; return their number.
 
     Along each direction the pixels within `REACH` of the outline are looked at, and up to
@@ -64,7 +68,7 @@ def gather(edges: Edges, height: Plane, step: float, shape: Shape, coarse: int, 
     x, y, radius = shape[0], shape[1], shape[2]
     lines, width = edges.pixels.shape
     count, n = 0, max(20, directions_of(radius) // coarse)
-    reach = max(3.0, REACH * radius)
+    reach = max(3.0, REACH[stage] * radius)
     cosine, sine = math.cos(2 * math.pi / n), math.sin(2 * math.pi / n)
     c, s = cosine, -sine
     for _ in range(n):
@@ -72,8 +76,9 @@ def gather(edges: Edges, height: Plane, step: float, shape: Shape, coarse: int, 
         if len(height) and rise(height, x, y, c, s, radius) > step:
             continue
         taken, last = 0, -1
+        inner = radius + shape[3] * (c * c - s * s) + shape[4] * 2 * s * c - reach
         for k_t in range(int(2 * reach) + 1):
-            t = radius - reach + k_t
+            t = inner + k_t
             u, v = int(x + t * c + 0.5), int(y + t * s + 0.5)
             if t < 1 or u < 0 or v < 0 or u >= width or v >= lines:
                 continue
@@ -141,15 +146,17 @@ def _accumulate(
 
 
 @jit
-def fit_outline(edges: Edges, rows: Rows, count: int, shape: Shape, times: float) -> bool:
+def fit_outline(
+    edges: Edges, rows: Rows, count: int, shape: Shape, stage: int, times: float
+) -> bool:
     """Improve x, y, r, p, q (5,) in place; False where the points do not hold it in place.
 
     Each point stands for so many `times` points of the outline.
     """
     start_x, start_y, start_r = shape[0], shape[1], shape[2]
     a, b = np.empty((5, 5)), np.empty(5)
-    for turn in range(ROUNDS):
-        scale = max(1.0, (0.16, 0.09, 0.06)[turn] * shape[2])
+    for scale_of_radius in SCALES[stage]:
+        scale = max(1.0, scale_of_radius * shape[2])
         a[:] = 0
         b[:] = 0
         if times * _accumulate(edges, rows, count, shape, scale, a, b) < 4:
@@ -169,6 +176,15 @@ def fit_outline(edges: Edges, rows: Rows, count: int, shape: Shape, times: float
         if moved > max(3.0, 0.4 * start_r) or not 0.6 * start_r < shape[2] < 1.6 * start_r:
             return False
     return True
+
+
+@jit
+def fit_around(
+    edges: Edges, height: Plane, pixel: float, shape: Shape, stage: int, rows: Rows
+) -> bool:
+    """Fit an outline (5,) in place to the edge points around it; False where they do not hold it."""
+    count = gather(edges, height, step_up(shape[2] * pixel), shape, stage, 2, rows)
+    return count >= 5 and fit_outline(edges, rows, count, shape, stage, 2)
 
 
 @jit
@@ -240,8 +256,10 @@ def refit(
             shape[0], shape[1] = candidates[k, 0], candidates[k, 1]
             shape[2] = min(largest, start * candidates[k, 2])
             shape[3] = shape[4] = 0
-            count = gather(edges, height, step_up(shape[2] * pixel), shape, 2, rows)
-            if count < 5 or not fit_outline(edges, rows, count, shape, 2):
+            if not (
+                fit_around(edges, height, pixel, shape, WIDE, rows)
+                and fit_around(edges, height, pixel, shape, NARROW, rows)
+            ):
                 continue
             within = smallest * 0.9 <= shape[2] <= largest * 1.1
             if not within or _known(shape, shapes, cells, following):
