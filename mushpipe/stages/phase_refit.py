@@ -182,7 +182,7 @@ def fit_outline(
 def fit_around(
     edges: Edges, height: Plane, pixel: float, shape: Shape, stage: int, rows: Rows
 ) -> bool:
-    """Fit an outline (5,) in place to the edge points around it; False where they do not hold it."""
+    """Fit an outline (5,) to the edge points around it, in place; False if they do not hold it."""
     count = gather(edges, height, step_up(shape[2] * pixel), shape, stage, 2, rows)
     return count >= 5 and fit_outline(edges, rows, count, shape, stage, 2)
 
