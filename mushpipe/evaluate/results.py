@@ -35,6 +35,7 @@ class Detections(Columns):
         sigma_position: (N, 3) m one sigma.
         sigma_diameter: (N,) m one sigma.
         sigma_tilt: (N,) rad one sigma.
+        score: (N,) 0..1, how likely it is right.
         frame_id: The frame of the 3D values.
     """
 
@@ -48,6 +49,7 @@ class Detections(Columns):
     sigma_position: Floats = column(3)
     sigma_diameter: Floats = column()
     sigma_tilt: Floats = column()
+    score: Floats = column()
     frame_id: str = ""
 
 
@@ -75,6 +77,7 @@ def of_picks(picks: Picks, locations: Locations | None = None) -> Detections:
         sigma_position=picks.sigma_position,
         sigma_diameter=picks.sigma_diameter,
         sigma_tilt=picks.sigma_tilt,
+        score=picks.score,
         frame_id=picks.frame_id,
     )
 
@@ -94,6 +97,7 @@ def of_circles(circles: Circles) -> Detections:
         sigma_position=vectors,
         sigma_diameter=numbers,
         sigma_tilt=numbers,
+        score=circles.score,
     )
 
 

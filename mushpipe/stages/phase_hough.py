@@ -215,4 +215,4 @@ def _foreground(mask: Mask, relief: Relief | None) -> Bytes:
     height, width = foreground.shape
     standing = (relief.height > _STANDING).view(np.uint8)
     full = cv2.resize(standing, None, fx=CELL, fy=CELL, interpolation=cv2.INTER_NEAREST)
-    return foreground | full[:height, :width]
+    return np.asarray(foreground | full[:height, :width], np.uint8)

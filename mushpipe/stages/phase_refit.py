@@ -114,15 +114,16 @@ def solve(a: Table, b: Table) -> None:
 
 @jit
 def _accumulate(
-    edges: Edges, rows: Rows, count: int, shape: Shape, scale: float,
-    a: Table, b: Table,
-) -> float:  # fmt: skip
-    """Add the normal equations of the edge points to a (5, 5), b (5,); return the sum of weights.
+    edges: Edges, rows: Rows, count: int, shape: Shape, scale: float, a: Table, b: Table
+) -> float:
+    """Write the normal equations of the edge points to a (5, 5), b (5,); return the weights' sum.
 
     `shape` is x, y, r, p, q; `scale` the residual (px) at which a weight has fallen to a quarter.
+    The Jacobian of a point is c, s, 1, cos 2t, sin 2t. Sums in variables of their own stay in
+    registers: a third of the time of sums in an array.
     """
-    total = 0.0
-    j = np.empty(5)
+    total = a00 = a01 = a02 = a03 = a04 = a11 = a12 = a13 = a14 = 0.0
+    a23 = a24 = a33 = a34 = a44 = b0 = b1 = b2 = b3 = b4 = 0.0
     for k in range(count):
         row = rows[k]
         dx, dy = edges.x[row] - shape[0], edges.y[row] - shape[1]
@@ -130,18 +131,24 @@ def _accumulate(
         if d < 1:
             continue
         c, s = dx / d, dy / d
-        c2, s2 = c * c - s * s, 2 * s * c
-        e = d - (shape[2] + shape[3] * c2 + shape[4] * s2)
         facing = -(c * edges.nx[row] + s * edges.ny[row])
         if facing < TURNED:
             continue
-        w = edges.weight[row] * facing / (1 + (e / scale) ** 2) ** 2
-        j[0], j[1], j[2], j[3], j[4] = c, s, 1.0, c2, s2
-        for m in range(5):
-            b[m] += w * j[m] * e
-            for n in range(m, 5):
-                a[m, n] += w * j[m] * j[n]
+        c2, s2 = c * c - s * s, 2 * s * c
+        e = d - (shape[2] + shape[3] * c2 + shape[4] * s2)
+        far = 1 + (e / scale) ** 2
+        w = edges.weight[row] * facing / (far * far)
+        wc, ws, w3, w4 = w * c, w * s, w * c2, w * s2
         total += w
+        a00, a01, a02, a03, a04 = a00 + wc * c, a01 + wc * s, a02 + wc, a03 + wc * c2, a04 + wc * s2
+        a11, a12, a13, a14 = a11 + ws * s, a12 + ws, a13 + ws * c2, a14 + ws * s2
+        a23, a24, a33, a34, a44 = a23 + w3, a24 + w4, a33 + w3 * c2, a34 + w3 * s2, a44 + w4 * s2
+        b0, b1, b2, b3, b4 = b0 + wc * e, b1 + ws * e, b2 + w * e, b3 + w3 * e, b4 + w4 * e
+    a[0, 0], a[0, 1], a[0, 2], a[0, 3], a[0, 4] = a00, a01, a02, a03, a04
+    a[1, 1], a[1, 2], a[1, 3], a[1, 4] = a11, a12, a13, a14
+    a[2, 2], a[2, 3], a[2, 4] = total, a23, a24
+    a[3, 3], a[3, 4], a[4, 4] = a33, a34, a44
+    b[0], b[1], b[2], b[3], b[4] = b0, b1, b2, b3, b4
     return total
 
 
@@ -157,8 +164,6 @@ def fit_outline(
     a, b = np.empty((5, 5)), np.empty(5)
     for scale_of_radius in SCALES[stage]:
         scale = max(1.0, scale_of_radius * shape[2])
-        a[:] = 0
-        b[:] = 0
         if times * _accumulate(edges, rows, count, shape, scale, a, b) < 4:
             return False
         prior = 4 / times / max(1.0, (OVAL * shape[2]) ** 2)
