@@ -21,8 +21,8 @@ Shape = NDArray[np.float64]
 Table = NDArray[np.float64]
 DIRECTIONS = 96
 # A wide fit, then a narrow one to the edge points around what it found; both of the radius.
-REACH = (0.4, 0.2)  # how far from the outline edge points are looked for
-SCALES = ((0.25, 0.14), (0.09, 0.05))  # the residual at which a weight has fallen to a quarter
+REACH = (0.3, 0.2)  # how far from the outline edge points are looked for
+SCALES = ((0.18, 0.1), (0.08, 0.05))  # the residual at which a weight has fallen to a quarter
 WIDE, NARROW = 0, 1
 OVAL = 0.12  # of the radius: expected size of p and q
 TURNED = 0.7  # cosine between an edge's normal and the radius
