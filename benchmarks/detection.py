@@ -13,6 +13,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -58,7 +59,9 @@ def tiled(frame: RgbdFrame, times: int) -> RgbdFrame:
     """Return a frame of `times` x `times` copies: so many more pixels, and caps."""
     color = np.tile(frame.color, (times, times, 1))
     depth = None if frame.depth is None else np.tile(frame.depth, (times, times))
-    return RgbdFrame(frame.header, color, depth, frame.depth_scale, frame.camera)
+    height, width = color.shape[:2]
+    camera = frame.camera and replace(frame.camera, width=width, height=height)
+    return RgbdFrame(frame.header, color, depth, frame.depth_scale, camera)
 
 
 def cpu_ms(run: Chain, frame: RgbdFrame, repeats: int) -> float:
