@@ -7,6 +7,7 @@ from mushpipe.core.plugins import Registry, hookimpl
 def mushpipe_register(registry: Registry) -> None:
     """Register the built-in sources, stages and sinks."""
     registry.source("mcap", "mushpipe.sources.mcap:McapSource")
+    registry.source("stream", "mushpipe.sources.stream:StreamSource")
     registry.source("realsense", "mushpipe.sources.realsense:RealsenseSource")
     registry.source("synthetic", "mushpipe.sources.synthetic:SyntheticSource")
     registry.stage("otsu", "mushpipe.stages.otsu:Otsu")
@@ -21,6 +22,7 @@ def mushpipe_register(registry: Registry) -> None:
     registry.stage("nearest-depth", "mushpipe.stages.nearest_depth:NearestDepth")
     registry.stage("depth-correct", "mushpipe.stages.depth_correct:DepthCorrect")
     registry.stage("fuse-depth", "mushpipe.stages.fuse_depth:FuseDepth")
+    registry.stage("surface-fit", "mushpipe.stages.surface_fit:SurfaceFit")
     registry.stage("cap-fit", "mushpipe.stages.cap_fit:CapFit")
     registry.stage("registration", "mushpipe.stages.registration:Registration")
     registry.stage("picks", "mushpipe.stages.picks:MakePicks")
