@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
+from mushpipe.stages.linear import solve
 from mushpipe.stages.phase_edges import Edges, Plane, Rows, Singles
 from mushpipe.stages.phase_steps import rise, step_up
 
@@ -63,7 +64,8 @@ def gather(
 
     Along each direction the pixels within `REACH` of the outline are looked at, and up to
     `PER_DIRECTION` edge points taken; none where it is higher outside by `step` (m), for there
-    something nearer hides the outline. `coarse` is by how much fewer directions are looked at.
+    something nearer hides the outline. `stage` is `WIDE` or `NARROW`, `coarse` by how much fewer
+    directions are looked at.
     """
     x, y, radius = shape[0], shape[1], shape[2]
     lines, width = edges.pixels.shape
@@ -94,22 +96,6 @@ def gather(
         if count == len(rows):
             break
     return count
-
-
-@jit
-def solve(a: Table, b: Table) -> None:
-    """Solve a x = b in place for a small positive definite matrix; x replaces b."""
-    size = len(b)
-    for i in range(size):
-        for j in range(i + 1, size):
-            factor = a[j, i] / a[i, i]
-            for k in range(i, size):
-                a[j, k] -= factor * a[i, k]
-            b[j] -= factor * b[i]
-    for i in range(size - 1, -1, -1):
-        for k in range(i + 1, size):
-            b[i] -= a[i, k] * b[k]
-        b[i] /= a[i, i]
 
 
 @jit
