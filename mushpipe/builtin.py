@@ -18,6 +18,7 @@ def mushpipe_register(registry: Registry) -> None:
     registry.stage("opening", "mushpipe.stages.opening:Opening")
     registry.stage("phase-hough", "mushpipe.stages.phase_hough:PhaseHough")
     registry.stage("hough", "mushpipe.stages.hough:Hough")
+    registry.stage("hough-skimage", "mushpipe.stages.hough:HoughSkimage")
     registry.stage("nearest-depth", "mushpipe.stages.nearest_depth:NearestDepth")
     registry.stage("depth-correct", "mushpipe.stages.depth_correct:DepthCorrect")
     registry.stage("fuse-depth", "mushpipe.stages.fuse_depth:FuseDepth")
