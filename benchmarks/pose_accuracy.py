@@ -33,6 +33,7 @@ FLOOR = {
     "depth_noise_per_m": 0,
     "circle_sigma_px": 0.3,
 }
+SLOW = ("registration", "ICP")
 Method = Callable[[list[RgbdFrame], Circles], tuple[Locations, Poses]]
 
 
@@ -153,6 +154,9 @@ def main() -> None:
         "towards the camera": trivial("camera"),
         "registration": registered(),
         "registration, cap": registered(model="cap"),
+        "ICP from upright, cap": registered(
+            **{"model": "cap", "global": "none", "local": "point-to-plane"}
+        ),
     }
     print(HEAD)
     for name in options.sets.split(","):
@@ -162,7 +166,10 @@ def main() -> None:
                 taken = frames(scene, seed, options.family, 5, options.cache)
                 circles, rows = detected(taken[0])
                 for method, run in methods.items():
-                    if method.startswith("registration") and seed - first >= options.registration:
+                    if (
+                        method.startswith(("registration", "ICP"))
+                        and seed - first >= options.registration
+                    ):
                         continue
                     if method.startswith("floor"):
                         clean = frames(scene, seed, options.family, 1, options.cache, sensor=EXACT)
