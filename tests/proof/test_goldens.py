@@ -13,7 +13,6 @@ from tests.proof.goldens import CASES, FOLDER, GRAPHS, RECORDINGS, ROOT, Case, r
 
 # Built-in plugins that no recording can show, each with the tests that stand in.
 ELSEWHERE = {
-    "stream": "tests/cli/test_stream.py",  # it reads a pipe
     "realsense": "tests/live",  # needs librealsense's software device
     "foxglove": "tests/io/test_foxglove.py",  # it keeps nothing
     "stream": "tests/cli/test_stream.py",  # it reads a pipe
