@@ -59,7 +59,7 @@ def test_colour_alone_runs_and_says_what_is_missing(folder: Path) -> None:
     assert done.returncode == EXIT_OK, done.stderr
     assert "a.mcap has no depth: positions, distances and diameters will be missing" in done.stderr
     assert "the frame size changes from 160x120 to 160x100 at frame 1" in done.stderr
-    assert "2 of 2 picks have no position: there is no depth at them" in done.stderr
+    assert "2 of 2 mushrooms have no position: there is no depth at them" in done.stderr
 
 
 def test_a_size_that_does_not_fit_the_calibration_ends_the_run(folder: Path) -> None:

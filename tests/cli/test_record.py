@@ -189,7 +189,9 @@ def test_what_a_disk_is_too_slow_for_is_told(tmp_path: Path) -> None:
     assert f"{lost} frames were lost because writing was too slow" in told
     frames, damage = played(tmp_path / "out.mcap")
     assert (len(frames), damage) == (kept, "")
-    assert (frames[0].header.sequence, frames[-1].header.sequence) == (0, 99)
+    numbers = [frame.header.sequence for frame in frames]
+    assert numbers == sorted(set(numbers))
+    assert numbers[-1] == 99
 
 
 def test_every_part_of_a_split_recording_is_complete(scene: Path, tmp_path: Path) -> None:

@@ -163,7 +163,7 @@ def test_live_and_every_kind_of_recording_of_a_scene_give_the_same_picks(tmp_pat
     run_demo(tmp_path, "{use: realsense, file: scene.bag}", "bag.mcap")
     first, replay, bag = (results(tmp_path / f"{n}.mcap") for n in ("live", "replay", "bag"))
     assert len(first["/mushpipe/pick"]) == FRAMES
-    assert b'"id":[0,1' in first["/mushpipe/pick"][0][1]
+    assert len(json.loads(first["/mushpipe/pick"][0][1])["id"]) > 1
     assert bag == first
     manifest = RecordingReader(tmp_path / "live.mcap").index().metadata[MANIFEST]["json"]
     assert json.loads(manifest)["device"]["serial_number"] == SERIAL
