@@ -45,8 +45,8 @@ def averaged(slow: nn.Module, fast: nn.Module, step: int) -> None:
                 a.copy_(b)
 
 
-def train(frames: list[Picture], steps: int, seed: int) -> CapNet:
-    """Return a trained network: the running mean of its weights.
+def train(frames: list[Picture], steps: int, seed: int, out: Path) -> None:
+    """Train a network and write the running mean of its weights, every hundred steps.
 
     AdamW with a linear warm-up over 100 steps and a cosine to zero.
     """
@@ -77,7 +77,7 @@ def train(frames: list[Picture], steps: int, seed: int) -> CapNet:
                 flush=True,
             )
             total = 0.0
-    return slow.eval()
+            torch.save(slow.state_dict(), out)
 
 
 def main() -> None:
@@ -91,8 +91,7 @@ def main() -> None:
     arguments = parser.parse_args()
     seeds = range(TRAINING_SEED, TRAINING_SEED + arguments.frames)
     frames = [picture(seed, arguments.cache) for seed in seeds]
-    net = train(frames, arguments.steps, arguments.seed)
-    torch.save(net.state_dict(), arguments.out)
+    train(frames, arguments.steps, arguments.seed, arguments.out)
 
 
 if __name__ == "__main__":
