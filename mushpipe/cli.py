@@ -85,7 +85,6 @@ def _compile(graph: Path, overrides: list[Any], source: str | None) -> Plan:
 def _execute(plan: Plan, manifest: Path | None, capsules: Path) -> int:
     """Run a plan in front of a user; ``manifest`` None writes none. Return the exit code."""
     from mushpipe.console import interruptible, progress_bar, show_report, stderr
-    from mushpipe.core.manifest import build_manifest
     from mushpipe.core.run import run as run_plan
 
     stop = threading.Event()
@@ -94,7 +93,7 @@ def _execute(plan: Plan, manifest: Path | None, capsules: Path) -> int:
     show_report(report)
     if manifest is not None and report.exit_code != 2:  # a wrong command line is no run
         manifest.parent.mkdir(parents=True, exist_ok=True)
-        content = {**build_manifest(plan), "result": report.summary()}
+        content = {**report.manifest, "result": report.summary()}
         manifest.write_text(json.dumps(content, indent=2) + "\n")
         stderr.print(f"manifest: {manifest}", style="dim")
     if report.error is not None:

@@ -61,9 +61,10 @@ class RunReport:
     """The result of a run.
 
     ``read`` counts frames the source delivered, ``waiting`` those that were read ahead and never
-    looked at because the run ended early.
+    looked at because the run ended early. ``manifest`` says what the run was made of.
     """
 
+    manifest: dict[str, Any] = field(default_factory=dict)
     read: int = 0
     waiting: int = 0
     processed: int = 0

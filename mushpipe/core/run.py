@@ -74,8 +74,10 @@ class _Runner:
             raise TypeError("the plan's source is not a Source")
         reader = SourceThread(self.plan.source, source, threading.Event())
         with _named(self.plan.source):
-            manifest = build_manifest(self.plan)
-            info = RunInfo(source.name(), manifest, source.live, lambda: reader.box.accepted)
+            self.report.manifest = build_manifest(self.plan)
+            info = RunInfo(
+                source.name(), self.report.manifest, source.live, lambda: reader.box.accepted
+            )
             self._spare_the_recording(source, info)
         with ExitStack() as stack:
             stack.enter_context(_opened(self.plan.source, _opener(self.plan.source)))

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 import socket
 import ssl
+import time
 from types import TracebackType
 from typing import Any
 
@@ -15,6 +17,8 @@ class RobotClient:
     """A connection to the robot socket; use it in a ``with`` block.
 
     After ``timeout_s`` without a line the server counts as dead and every method raises OSError.
+    ``late_ms`` is how much later the last line came than the quickest one of this connection: what
+    a network or our own slowness held back, which in mode ``stream`` counts towards ``valid_ms``.
 
     Raises:
         OSError: The server cannot be reached, is silent, or has gone.
@@ -36,6 +40,8 @@ class RobotClient:
             self._socket = tls.wrap_socket(self._socket, server_hostname=host)
         self._lines = self._socket.makefile("rb")
         self._id = 0
+        self._quickest_ms = math.inf
+        self.late_ms = 0.0
         self.hello = self.receive()
         self.send("hello", version="1.0", mode=mode, **hello)
         first = self.hello if self.hello["op"] == "error" else self.receive()
@@ -53,6 +59,10 @@ class RobotClient:
         if not line.endswith(b"\n"):
             raise ConnectionError("the server has gone")
         message: Message = json.loads(line)
+        if "t_ms" in message:
+            delay_ms = time.monotonic() * 1000 - message["t_ms"]
+            self._quickest_ms = min(self._quickest_ms, delay_ms)
+            self.late_ms = delay_ms - self._quickest_ms
         return message
 
     def ask(self, op: str, **fields: Any) -> Message:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from enum import StrEnum
@@ -114,6 +115,9 @@ def _talk(
             else:
                 message = connection.ask("get_targets", **asked)
             _show(message, raw)
+            if connection.late_ms > message.get("valid_ms", math.inf):
+                _note(f"{connection.late_ms:.0f} ms late on the way: no longer valid")
+                message["targets"] = []
             shown += message["op"] != "heartbeat"
             if message["op"] == "bye":
                 raise ConnectionError(f"the server says bye: {message['reason']}")

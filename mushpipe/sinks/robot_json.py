@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import Field, PrivateAttr
 
 from mushpipe import GraphPath, Picks, RunInfo, Sink, Trace
-from mushpipe.core.errors import EXIT_NO_DEVICE, UsageError
+from mushpipe.core.errors import EXIT_INTERRUPTED, EXIT_NO_DEVICE, EXIT_OK, UsageError
 from mushpipe.robot.abb import AbbSession
 from mushpipe.robot.clock import Clock, Placer
 from mushpipe.robot.connection import Limits
@@ -69,7 +69,7 @@ class RobotJsonSink(Sink):
     max_clients: int = Field(8, ge=1, le=64, description="more are turned away")
     lines_per_s: float = Field(200, ge=10, le=100_000, description="a client that says more waits")
     token_file: GraphPath | None = Field(
-        None, description="file with a secret that clients must know, 16 characters or more"
+        None, description="file with the clients' secret: 16 to 40 of A-Z a-z 0-9 _ . ~ -"
     )
     tls_cert: GraphPath | None = Field(None, description="certificate chain, PEM; turns TLS on")
     tls_key: GraphPath | None = Field(None, description="private key, PEM; in tls_cert if not set")
@@ -201,7 +201,11 @@ class RobotJsonSink(Sink):
     def finish(self, summary: Mapping[str, Any]) -> None:
         """Note how the run ended, for the robots' last word."""
         code = summary.get("exit_code")
-        endings: dict[Any, Ending] = {0: "end", EXIT_NO_DEVICE: "no_camera"}
+        endings: dict[Any, Ending] = {
+            EXIT_OK: "end",
+            EXIT_INTERRUPTED: "end",
+            EXIT_NO_DEVICE: "no_camera",
+        }
         self._ending = endings.get(code, "failed")
 
     def close(self) -> None:

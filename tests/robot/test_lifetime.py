@@ -11,6 +11,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -80,6 +81,13 @@ def test_the_reference_client_is_killed_and_comes_back() -> None:
             assert message["seq"] == 3
 
 
+def serve_lines(listening: socket.socket, lines: list[dict[str, Any]]) -> None:
+    connection, _ = listening.accept()
+    with connection:
+        connection.sendall(b"".join(json.dumps(line).encode() + b"\n" for line in lines))
+        connection.recv(65536)
+
+
 class Cable:
     """A wire that can be cut without either end being told."""
 
@@ -141,3 +149,18 @@ def test_the_reference_client() -> None:
                 pass
             with pytest.raises(OSError, match="gone"):
                 robot.receive()
+
+
+def test_the_reference_client_sees_what_a_slow_network_held_back() -> None:
+    """Two lines that the server wrote 600 ms apart arrive together."""
+    lines: list[dict[str, Any]] = [
+        {"op": "hello", "t_ms": 1000},
+        {"op": "heartbeat", "t_ms": 1000},
+        {"op": "targets", "t_ms": 1000},
+        {"op": "targets", "t_ms": 400},
+    ]
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        threading.Thread(target=serve_lines, args=(listening, lines), daemon=True).start()
+        with RobotClient(port=listening.getsockname()[1]) as robot:
+            fresh, late = [robot.receive() and robot.late_ms for _ in range(2)]
+    assert late - fresh >= 600

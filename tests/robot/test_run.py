@@ -126,6 +126,17 @@ def test_the_last_word_says_how_it_ended(
     assert running.end().exit_code == code
 
 
+def test_an_operator_who_stops_the_run_is_no_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    running = Running(monkeypatch, plan_of(), 2)
+    with Peer(running.port) as peer:
+        peer.greet("stream")
+        running.steps[0].set()
+        peer.wait("targets")
+        running.stop.set()
+        assert peer.wait("bye")["reason"] == "end"
+    assert running.end().exit_code == 130
+
+
 def test_a_camera_that_falls_silent_is_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
     running = Running(monkeypatch, plan_of(stall_ms=100), 2)
     with Peer(running.port) as peer:
