@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mushpipe.evaluate.cli import register as register_eval
+from mushpipe.proof.cli import register as register_proof
 from mushpipe.robot.commands import app as robot_app
 
 if TYPE_CHECKING:
@@ -256,6 +257,7 @@ def plugins_describe(
 
 
 register_eval(app)
+register_proof(app)
 
 
 def main() -> None:

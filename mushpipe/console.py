@@ -73,15 +73,22 @@ def progress_bar() -> Iterator[Any]:
         yield show
 
 
+def durations_table(report: RunReport) -> Table:
+    """Return what each node took for a frame; the total is that of the stages."""
+    columns = ("p50 ms", "p95 ms", "p99 ms", "max ms")
+    table = Table("", *columns, box=None, pad_edge=False)
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for name, durations in {**report.durations, "all stages": report.frame}.items():
+        if durations.count:
+            table.add_row(name, *(f"{value:.2f}" for value in durations.summary().values()))
+    return table
+
+
 def show_report(report: RunReport) -> None:
     """Print the time per stage, the balance, and what was lost."""
-    if any(d.count for d in report.durations.values()):
-        table = Table("stage", "p50 ms", "p95 ms", "max ms", box=None, pad_edge=False)
-        for column in table.columns[1:]:
-            column.justify = "right"
-        for name, durations in report.durations.items():
-            table.add_row(name, *(f"{value:.2f}" for value in durations.summary().values()))
-        stderr.print(table)
+    if report.frame.count:
+        stderr.print(durations_table(report))
     rate = report.processed / report.elapsed_s if report.elapsed_s else 0.0
     stderr.print(
         f"{report.frames_in} frames in = {report.processed} processed + {report.dropped} dropped "

@@ -11,7 +11,7 @@ from typing import Any
 from mushpipe.core.errors import MushpipeError, StageError
 from mushpipe.core.mailbox import Mailbox
 from mushpipe.core.plan import Node
-from mushpipe.core.report import SinkReport
+from mushpipe.core.report import Durations, SinkReport
 from mushpipe.core.stage import ReplaySource, Source
 from mushpipe.core.types import RgbdFrame
 
@@ -40,14 +40,26 @@ def paced(frames: Iterator[RgbdFrame], speed: float, stop: threading.Event) -> I
         yield frame
 
 
+def timed(frames: Iterator[RgbdFrame], durations: Durations) -> Iterator[RgbdFrame]:
+    """Yield frames, noting how long the source takes for each."""
+    begin = time.perf_counter_ns()
+    for frame in frames:
+        durations.add(time.perf_counter_ns() - begin)
+        yield frame
+        begin = time.perf_counter_ns()
+
+
 class SourceThread(threading.Thread):
     """Reads ahead; ``error`` holds what ended the source early."""
 
-    def __init__(self, node: Node, source: Source, stop: threading.Event) -> None:
+    def __init__(
+        self, node: Node, source: Source, stop: threading.Event, durations: Durations
+    ) -> None:
         super().__init__(name="mushpipe-source", daemon=True)
         self.node = node
         self.source = source
         self.stop = stop
+        self.durations = durations
         self.error: MushpipeError | None = None
         self.box: Mailbox[RgbdFrame] = (
             Mailbox(1, latest=True) if source.live else Mailbox(READ_AHEAD)
@@ -67,8 +79,9 @@ class SourceThread(threading.Thread):
     def _read(self) -> None:
         speed = self.source.speed if isinstance(self.source, ReplaySource) else 0.0
         frames = self.source.frames()
+        timed_frames = timed(frames, self.durations)
         try:
-            for frame in islice(paced(frames, speed, self.stop), self.source.max_frames):
+            for frame in islice(paced(timed_frames, speed, self.stop), self.source.max_frames):
                 if self.stop.is_set() or not self.box.put(frame):
                     break
         finally:
@@ -79,10 +92,11 @@ class SourceThread(threading.Thread):
 class SinkThread(threading.Thread):
     """Feeds one sink in order; with ``tolerant`` a failing frame is counted and the next tried."""
 
-    def __init__(self, node: Node, latest: bool, tolerant: int) -> None:
+    def __init__(self, node: Node, latest: bool, tolerant: int, durations: Durations) -> None:
         super().__init__(name=f"mushpipe-{node.name}", daemon=True)
         self.node = node
         self.tolerant = tolerant
+        self.durations = durations
         self.error: MushpipeError | None = None
         self.failed_frame: RgbdFrame | None = None
         self.consumed = self.failed = 0
@@ -97,7 +111,9 @@ class SinkThread(threading.Thread):
         while (item := self.box.get()) is not None:
             frame, inputs = item
             try:
+                begin = time.perf_counter_ns()
                 consume(**inputs)
+                self.durations.add(time.perf_counter_ns() - begin)
                 self.consumed += 1
                 in_a_row = 0
             except (Exception, SystemExit) as error:

@@ -62,7 +62,8 @@ class _Runner:
         self.stop = stop
         self.progress = progress
         self.capsules = capsules
-        self.report = RunReport(durations={node.name: Durations() for node in plan.stages})
+        nodes = (plan.source, *plan.stages, *plan.sinks)
+        self.report = RunReport(durations={node.name: Durations() for node in nodes})
         on_error = plan.on_error or ("fail" if plan.replay() else "skip")
         self.tolerance = plan.max_failures if on_error == "skip" else 1
         self.started = time.monotonic()
@@ -72,7 +73,12 @@ class _Runner:
         source = self.plan.source.plugin
         if not isinstance(source, Source):
             raise TypeError("the plan's source is not a Source")
-        reader = SourceThread(self.plan.source, source, threading.Event())
+        reader = SourceThread(
+            self.plan.source,
+            source,
+            threading.Event(),
+            self.report.durations[self.plan.source.name],
+        )
         with _named(self.plan.source):
             self.report.manifest = build_manifest(self.plan)
             info = RunInfo(
@@ -124,7 +130,8 @@ class _Runner:
                 logger.warning("%s", failed)
 
     def _sink_thread(self, node: Node) -> SinkThread:
-        return SinkThread(node, self.plan.delivery(node) == "latest", self.tolerance)
+        durations = self.report.durations[node.name]
+        return SinkThread(node, self.plan.delivery(node) == "latest", self.tolerance, durations)
 
     def _loop(self, reader: SourceThread, threads: list[SinkThread]) -> None:
         for thread in (reader, *threads):
@@ -195,6 +202,7 @@ class _Runner:
                 raise failed from error
             durations[node.name] = time.perf_counter_ns() - begin
             self.report.durations[node.name].add(durations[node.name])
+        self.report.frame.add(sum(durations.values()))
         return Trace(frame, outputs, durations)
 
     def _call(

@@ -16,17 +16,17 @@ from mushpipe.stages.linear import least_squares
 
 Floats = NDArray[np.float64]
 Plane = NDArray[np.float32]
-CELL = 16
+# Wide cells see the bed between dense caps, fine ones follow the soil.
+CELL, FINE_CELL = 32, 16  # px
 RELIEF_M = 0.02  # largest departure of the soil from the plane
-ROUGH_M = 0.004  # roughness below the size of a cap
+# What lies farther above or below the surface is not bed. Caps only ever rise above it.
+RISE_M, FALL_M = 0.006, 0.018
+_FEWEST = 12
 _REACH_CELLS = 2.5
 
 
 def bed_depth(depth_m: Plane, relief: bool = True) -> Plane | None:
     """Fit the bed and return its depth at every pixel.
-
-    Caps only ever rise above the bed, so the fit starts from the far side of each cell of 16 x 16
-    px and then drops, round by round, the cells that stand above the surface.
 
     Args:
         depth_m: (H, W) metres, NaN = missing.
@@ -35,15 +35,17 @@ def bed_depth(depth_m: Plane, relief: bool = True) -> Plane | None:
     Returns:
         (H, W) metres, or None where there is too little depth for a fit.
     """
-    far = far_cells(depth_m, CELL)
-    known = np.isfinite(far)
-    if known.sum() < 12:
+    coefficients = fit_plane(far_cells(depth_m, CELL))
+    if coefficients is None:
         return None
-    rows, columns = far.shape
-    plane = fit_plane(far, known)
-    surface = plane + bend(far - plane, known) if relief else plane
-    # The centre of cell i lies at (i + 0.5) CELL - 0.5 px, as cv2.resize assumes.
-    size = (columns * CELL, rows * CELL)
+    far = far_cells(depth_m, FINE_CELL)
+    rows, columns, _ = far.shape
+    # The centre of cell i lies at (i + 0.5) cells - 0.5 px, as cv2.resize assumes.
+    v, u = np.mgrid[:rows, :columns] * FINE_CELL + (FINE_CELL - 1) / 2
+    surface = plane_depth(coefficients, u, v)
+    if relief:
+        surface += bend(far[..., 2] - plane_depth(coefficients, far[..., 0], far[..., 1]))
+    size = (columns * FINE_CELL, rows * FINE_CELL)
     full = cv2.resize(surface.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
     height, width = depth_m.shape
     edge = (0, height - size[1], 0, width - size[0])
@@ -51,54 +53,83 @@ def bed_depth(depth_m: Plane, relief: bool = True) -> Plane | None:
 
 
 @jit
-def far_cells(depth_m: Plane, cell: int) -> Plane:
-    """Return the 90th percentile of depth per cell; NaN where less than 30 % is known.
+def far_cells(depth: Plane, cell: int) -> Floats:
+    """Return (H / cell, W / cell, 3): x, y (px) and depth of a far sample of each cell.
 
-    Every second pixel each way is looked at.
+    Of 4 x 4 samples of a cell it is the 90th percentile, at its own place, since on a slope the
+    far side lies off the middle. Its depth is NaN where less than a third is known. What is not
+    above 0 is missing. A cell is a multiple of 4 px.
     """
-    rows, columns = depth_m.shape[0] // cell, depth_m.shape[1] // cell
-    result = np.full((rows, columns), np.nan, np.float32)
-    values = np.empty(cell * cell, np.float32)
+    rows, columns = depth.shape[0] // cell, depth.shape[1] // cell
+    far = np.empty((rows, columns, 3))
+    found = np.empty((16, 3))
     for i in range(rows):
         for j in range(columns):
-            count = 0
-            for y in range(i * cell, (i + 1) * cell, 2):
-                for x in range(j * cell, (j + 1) * cell, 2):
-                    z = depth_m[y, x]
-                    if z > 0:  # false for NaN
-                        values[count] = z
-                        count += 1
-            if count >= 0.3 * (cell // 2) ** 2:
-                result[i, j] = np.sort(values[:count])[int(0.9 * (count - 1))]
-    return result
+            known = 0
+            for y in range(i * cell, (i + 1) * cell, cell // 4):
+                for x in range(j * cell, (j + 1) * cell, cell // 4):
+                    if depth[y, x] > 0:  # false for NaN
+                        found[known, 0], found[known, 1], found[known, 2] = x, y, depth[y, x]
+                        known += 1
+            far[i, j, 0], far[i, j, 1], far[i, j, 2] = j * cell, i * cell, np.nan
+            if 3 * known >= len(found):
+                _sort_farthest(found, known, known // 10)
+                far[i, j] = found[known // 10]
+    return far
 
 
-def fit_plane(far: Plane, known: NDArray[np.bool_]) -> Floats:
-    """Return the depth of a plane below the cells (rows, columns), by Tukey's biweight."""
-    i, j = np.nonzero(known)
-    basis = np.column_stack([np.ones(len(i)), i / len(far), j / len(far)])
-    z = far[known].astype(np.float64)
-    weight: Floats = np.ones(len(z))
-    solution: Floats = np.zeros(3)
-    for _ in range(12):
-        solution = least_squares(basis, 1 / z, weight)
+@jit
+def _sort_farthest(found: Floats, known: int, last: int) -> None:
+    """Sort the known rows from the farthest on, as far as to the last place that is asked for."""
+    for k in range(last + 1):
+        best = k
+        for m in range(k + 1, known):
+            if found[m, 2] > found[best, 2]:
+                best = m
+        for c in range(3):
+            found[k, c], found[best, c] = found[best, c], found[k, c]
+
+
+def fit_plane(points: Floats) -> Floats | None:
+    """Fit 1 / z = a + b x + c y by Tukey's biweight, tight for what rises, loose for what falls.
+
+    Args:
+        points: (..., 3) x, y (px or rays at z = 1) and depth z (m), NaN = missing.
+
+    Returns:
+        (3,) a, b, c; None where there are too few points.
+    """
+    x, y, z = points[np.isfinite(points[..., 2])].T
+    if len(z) < _FEWEST:
+        return None
+    scale = max(float(np.abs([x, y]).max()), 1e-6)
+    basis = np.column_stack([np.ones(len(z)), x / scale, y / scale])
+    weight, solution = np.ones(len(z)), np.zeros(3)
+    for _ in range(20):
+        before, solution = solution, least_squares(basis, 1 / z, weight)
+        if np.abs(solution - before).max() < 1e-4:  # 1/m
+            break
         above = 1 / np.maximum(basis @ solution, 1e-3) - z
-        # Tight for what rises, loose for what lies deeper; wide while most of it does not fit.
-        scaled = above / np.where(above > 0, 0.5 * RELIEF_M, 1.5 * RELIEF_M)
-        spread = max(1.0, 1.5 * float(np.median(np.abs(scaled))))
+        scaled = above / np.where(above > 0, RISE_M, FALL_M)
+        spread = max(1.0, 1.5 * float(np.median(np.abs(scaled))))  # wide while most does not fit
         weight = np.maximum(0, 1 - (scaled / spread) ** 2) ** 2 + 1e-6
-    u, v = np.meshgrid(np.arange(far.shape[1]), np.arange(far.shape[0]))
-    inverse = solution[0] + (solution[1] * v + solution[2] * u) / len(far)
-    return np.asarray(1 / np.maximum(inverse, 1e-3))
+    return solution / [1, scale, scale]
 
 
-def bend(rest: Floats, known: NDArray[np.bool_]) -> Floats:
+def plane_depth(coefficients: Floats, x: Floats, y: Floats) -> Floats:
+    """Return the depth of the plane 1 / z = a + b x + c y."""
+    a, b, c = coefficients
+    return np.asarray(1 / np.maximum(a + b * x + c * y, 1e-3))
+
+
+def bend(rest: Floats) -> Floats:
     """Return a smooth correction (rows, columns) that follows the cells of the bed.
 
-    Normalised convolution (Knutsson & Westin 1993), with a little weight on no correction where
-    caps hide the bed; cells that rise above the surface are dropped, round by round.
+    Normalised convolution (Knutsson & Westin 1993) of what the plane leaves, NaN = missing, with a
+    little weight on no correction where caps hide the bed; cells that rise above the surface are
+    dropped, round by round.
     """
-    values = np.where(known, rest, 0.0)
+    known, values = np.isfinite(rest), np.nan_to_num(rest)
     weight = known & (np.abs(values) < RELIEF_M)
     surface = np.zeros(rest.shape)
     for _ in range(4):
@@ -106,5 +137,5 @@ def bend(rest: Floats, known: NDArray[np.bool_]) -> Floats:
         total = cv2.GaussianBlur(share * values, (0, 0), _REACH_CELLS)
         surface = np.asarray(total / (cv2.GaussianBlur(share, (0, 0), _REACH_CELLS) + 0.02))
         above = surface - values
-        weight = known & (above < 1.5 * ROUGH_M) & (above > -4 * ROUGH_M)
+        weight = known & (above < RISE_M) & (above > -FALL_M)
     return surface

@@ -12,6 +12,7 @@ from mushpipe import Mask, RgbdFrame, Stage
 from mushpipe.stages.channels import MANY, Channel, channel_image
 from mushpipe.stages.otsu import initial_contour
 from mushpipe.stages.polarity import rise
+from mushpipe.stages.warm_up import example_frame
 
 Plane = NDArray[np.float32]
 Region = NDArray[np.bool_]
@@ -47,10 +48,8 @@ class ChanVese(Stage):
 
     def open(self) -> None:
         """Compile the kernels."""
-        image = np.zeros((64, 64), np.float32)
-        image[16:48, 16:48] = 1
-        if self.solver != "pde":
-            self.solve(image, image > 0.5)
+        self.process(example_frame())
+        self.process(example_frame(cap=20))  # inverted it is no longer the frame's own array
 
     def process(self, frame: RgbdFrame) -> Mask:
         """Return the mask with the contour it started from."""

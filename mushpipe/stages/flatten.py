@@ -18,6 +18,7 @@ from mushpipe import RgbdFrame, Stage
 from mushpipe.core.jit import jit
 from mushpipe.stages.linear import least_squares
 from mushpipe.stages.otsu import otsu_foreground
+from mushpipe.stages.warm_up import example_frame
 
 Plane = NDArray[np.float32]
 _DARK = 2.0  # keeps the logarithm of black finite, on 0..255
@@ -37,7 +38,7 @@ class Flatten(Stage):
 
     def open(self) -> None:
         """Compile the kernel."""
-        apply_gain(np.zeros((2, 2, 3), np.uint8), np.ones((2, 2), np.float32))
+        self.process(example_frame())
 
     def process(self, frame: RgbdFrame) -> RgbdFrame:
         """Return the frame under even light; depth and calibration are untouched."""

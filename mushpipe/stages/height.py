@@ -11,6 +11,7 @@ from mushpipe import Mask, RgbdFrame, Stage
 from mushpipe.core.jit import jit
 from mushpipe.stages.bed import bed_depth
 from mushpipe.stages.chan_vese_fast import solve_fast
+from mushpipe.stages.warm_up import example_frame
 
 Plane = NDArray[np.float32]
 REACH_PX = 32  # the widest gap that one side can fill: a shadow, or half of a shiny cap
@@ -33,9 +34,7 @@ class Height(Stage):
 
     def open(self) -> None:
         """Compile the kernels."""
-        solve_fast(np.zeros((64, 64), np.float32), np.eye(64, dtype=bool), 0.1)
-        filled(np.full((4, 4), np.nan, np.float32))
-        bed_depth(np.ones((64, 64), np.float32))
+        self.process(example_frame())
 
     def process(self, frame: RgbdFrame) -> Mask:
         """Return the mask; its initial contour is the plain threshold."""

@@ -26,4 +26,4 @@ def least_squares(columns: Floats, target: Floats, weight: Floats | None = None)
     weighted = columns if weight is None else columns * weight[:, None]
     normal = np.einsum("mi,mj->ij", weighted, columns)
     right = np.einsum("mi,m->i", weighted, target)
-    return np.asarray(np.linalg.pinv(normal, hermitian=True) @ right)
+    return np.asarray(np.linalg.lstsq(normal, right)[0])

@@ -40,7 +40,7 @@ def test_no_durations_have_no_quantile():
 def test_a_duration_of_nothing_counts():
     durations = Durations()
     durations.add(0)
-    assert durations.summary() == {"p50_ms": 0, "p95_ms": 0, "max_ms": 0}
+    assert durations.summary() == {"p50_ms": 0, "p95_ms": 0, "p99_ms": 0, "max_ms": 0}
 
 
 @pytest.mark.parametrize(
@@ -81,7 +81,7 @@ def test_the_summary_is_plain_data():
         "frames": {"in": 4, "processed": 2, "dropped": 1, "failed": 1, "balanced": True},
         "source": {"lost": 1},
         "sinks": {"out": {"handed": 2, "consumed": 2, "dropped": 0, "failed": 0}},
-        "stages": {"a": {"p50_ms": 2.0, "p95_ms": 2.0, "max_ms": 2.0}},
+        "durations": {"a": {"p50_ms": 2.0, "p95_ms": 2.0, "p99_ms": 2.0, "max_ms": 2.0}},
         "elapsed_s": 1.235,
         "capsules": ["c.mcap"],
     }

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mushpipe import Camera, RgbdFrame
-from mushpipe.stages.bed import bed_depth, far_cells
+from mushpipe.stages.bed import bed_depth
 from mushpipe.stages.height import (
     Height,
     filled,
@@ -125,16 +125,6 @@ def test_what_is_too_high_is_no_mushroom() -> None:
 def test_height_scales_to_half_at_the_middle() -> None:
     image = height_image(np.array([[-0.01, 0.0, 0.008, 0.016, 0.1, 0.2]], np.float32), 0.008, 0.15)
     np.testing.assert_allclose(image, [[0, 0, 0.5, 1, 1, 0]], atol=1e-6)
-
-
-def test_far_cells_are_the_far_percentile() -> None:
-    rng = np.random.default_rng(3)
-    depth = rng.uniform(0.4, 0.6, (32, 48)).astype(np.float32)
-    depth[:16, :16] = np.nan
-    far = far_cells(depth, 16)
-    assert np.isnan(far[0, 0])
-    looked_at = np.sort(depth[16:32:2, 32:48:2].ravel())
-    assert far[1, 2] == looked_at[int(0.9 * (looked_at.size - 1))]
 
 
 def test_filling_takes_the_lower_of_opposite_sides() -> None:

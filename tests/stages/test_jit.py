@@ -18,6 +18,38 @@ image[10:30, 10:30] = 1
 print(int(solve_fast(image, image > 0.5, 0.1).sum()))
 """
 
+FIRST_FRAME = """
+import sys
+from numba.core.dispatcher import Dispatcher
+from mushpipe.sources.synthetic import SyntheticSource
+from mushpipe.stages.chan_vese import ChanVese
+from mushpipe.stages.flatten import Flatten
+from mushpipe.stages.height import Height
+def compiled():
+    modules = [module for name, module in sys.modules.items() if name.startswith("mushpipe")]
+    kernels = {value for module in modules for value in vars(module).values()
+               if isinstance(value, Dispatcher)}
+    return sum(len(kernel.signatures) for kernel in kernels)
+frame = next(SyntheticSource(seed=3, width=320, height=240, count=30).frames())
+for stage in (ChanVese(solver="morphological"), ChanVese(), Flatten(), Height()):
+    stage.open()
+    before = compiled()
+    stage.process(frame)
+    print(before > 0, compiled() - before)
+"""
+
+
+def test_the_first_frame_compiles_nothing() -> None:
+    environment = {**os.environ, "PYTHONPATH": str(Path(mushpipe.__file__).parents[1])}
+    done = subprocess.run(
+        [sys.executable, "-c", FIRST_FRAME],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout == 4 * "True 0\n", done.stderr
+
 
 def test_kernels_run_where_numba_may_write_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[bool] = []

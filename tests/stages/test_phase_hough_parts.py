@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from mushpipe import Mask
+from mushpipe.stages.bed import far_cells, fit_plane, plane_depth
 from mushpipe.stages.phase_decide import lens, outline_features, overlap_features, probability
-from mushpipe.stages.phase_depth import bed_plane, closed, halved, relief_of
+from mushpipe.stages.phase_depth import GRID, closed, halved, relief_of
 from mushpipe.stages.phase_edges import Edges, edges_of, gradient_of, otsu_of
 from mushpipe.stages.phase_features import (
     DEPTH_FEATURES,
@@ -208,11 +209,11 @@ def test_a_bed_is_found_below_a_ball_and_at_a_slant() -> None:
     slant = 1 / (1 / 0.42 - 0.5 * ((np.arange(160) + 0.5) / 160 - 0.5))
     depth = np.minimum(ball, slant[None])
     small = halved(depth.astype(np.float32), 1.0)
-    plane = bed_plane(small)
+    plane = fit_plane(far_cells(small, GRID))
     assert plane is not None
-    u = (np.arange(80) + 0.5) / 80 - 0.5
-    middle = 1 / (plane[0] + plane[1] * u)
-    assert middle == pytest.approx(1 / (1 / 0.42 - 0.5 * u), abs=0.0005)
+    u = np.arange(80)
+    expected = 1 / (1 / 0.42 - 0.5 * ((u + 0.5) / 80 - 0.5))
+    assert plane_depth(plane, u, 30) == pytest.approx(expected, abs=0.0005)
 
 
 def test_heights_of_a_ball_over_the_bed() -> None:

@@ -1,0 +1,143 @@
+"""The verbs `mushpipe compare` and `mushpipe bench`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable, Iterator
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from mushpipe.core.plan import Plan
+    from mushpipe.proof.compare import Comparison, Difference
+
+_TIMES = ("p50 ms", "p95 ms", "p99 ms", "max ms")
+_FIGURES = (
+    *("frames", "frames_per_s", "cpu_ms_per_frame", "cores_busy"),
+    *("allocated_mb_per_frame", "peak_memory_mb", "memory_growth_mb"),
+)
+
+
+def compare(
+    a: Annotated[Path, typer.Argument(help="recording written by a sink mcap")],
+    b: Annotated[Path, typer.Argument(help="another, to be the same")],
+    tol: Annotated[
+        float, typer.Option(min=0, help="what numbers, and which share of pixels, may differ")
+    ] = 0.0,
+    topics: Annotated[str, typer.Option(help="compare only these, as '/mushpipe/*'")] = "*",
+    long: Annotated[bool, typer.Option("--long", help="tell of every frame")] = False,
+) -> None:
+    """Compare two result recordings; exit with 3 where they differ."""
+    from mushpipe.core.errors import EXIT_DIFFERS
+    from mushpipe.proof.compare import compare as compare_files
+
+    found = compare_files(a, b, tol, topics)
+    for line in _every(found.differences) if long else _summary(found.differences):
+        sys.stdout.write(line + "\n")
+    sys.stdout.write(_verdict(found) + "\n")
+    raise typer.Exit(EXIT_DIFFERS if found.differences else 0)
+
+
+def _every(differences: Iterable[Difference]) -> Iterator[str]:
+    for d in differences:
+        yield f"frame {d.sequence:5}  {d.topic}  {d.field or 'message'}: {d.text}"
+
+
+def _summary(differences: Iterable[Difference]) -> Iterator[str]:
+    """Yield one line per topic and field."""
+
+    def place(d: Difference) -> tuple[str, str]:
+        return d.topic, d.field
+
+    for (topic, name), group in groupby(sorted(differences, key=place), place):
+        members = sorted(group, key=lambda d: d.sequence)
+        first = members[0]
+        yield (
+            f"{topic}  {name or 'message'}: {len(members)} frames differ, "
+            f"first frame {first.sequence}: {first.text}"
+        )
+
+
+def _verdict(found: Comparison) -> str:
+    number = len(found.differences)
+    outcome = f"{number} differences" if number else "the same"
+    return f"{found.messages} messages on {len(found.topics)} topics: {outcome}"
+
+
+def bench(
+    graph: Annotated[Path, typer.Argument(help="graph file")],
+    recording: Annotated[
+        str | None, typer.Argument(help="recording to play in place of the graph's source")
+    ] = None,
+    frames: Annotated[int, typer.Option(help="frames to measure", min=10)] = 300,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", metavar="A.B=VALUE", help="change a setting")
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--json", help="file for the figures")] = None,
+    baseline: Annotated[
+        Path | None, typer.Option(help="figures of an earlier run, to compare with")
+    ] = None,
+    allow: Annotated[
+        float, typer.Option(help="exit with 3 where a median is more times the baseline's", min=1)
+    ] = 1.5,
+) -> None:
+    """Measure a graph: time of every node, frames/s, CPU, memory. It plays as fast as it goes."""
+    from mushpipe.console import set_up_logging
+    from mushpipe.core.errors import EXIT_DIFFERS
+    from mushpipe.proof.bench import bench as measure
+    from mushpipe.proof.bench import read_baseline, slower
+
+    set_up_logging(False)
+    before = read_baseline(baseline) if baseline else None
+    result = measure(lambda count: _plan(graph, recording, count, set_ or []), frames)
+    ratios = slower(result, before) if before else {}
+    _show(result, ratios)
+    if out is not None:
+        out.write_text(json.dumps(result, indent=2) + "\n")
+    raise typer.Exit(EXIT_DIFFERS if max(ratios.values(), default=0.0) > allow else 0)
+
+
+def _plan(graph: Path, recording: str | None, frames: int, overrides: list[str]) -> Plan:
+    """Compile a graph that plays its recording over and over, unpaced, up to so many frames."""
+    from mushpipe.core.document import read_document
+    from mushpipe.core.graph import compile_document
+    from mushpipe.core.plugins import load_registry
+
+    registry = load_registry()
+    settings = type(
+        compile_document(read_document(graph), registry, overrides, recording).source.plugin
+    ).model_fields
+    endless = [
+        f"source.{name}={value}"
+        for name, value in {"loop": 0, "speed": 0, "max_frames": frames}.items()
+        if name in settings
+    ]
+    return compile_document(read_document(graph), registry, [*overrides, *endless], recording)
+
+
+def _show(result: dict[str, Any], ratios: dict[str, float]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("", *_TIMES, *(["x baseline"] if ratios else []), box=None, pad_edge=False)
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for name, times in {**result["nodes"], "all stages": result["frame"]}.items():
+        ratio = [f"{ratios[name]:.2f}" if name in ratios else ""] if ratios else []
+        table.add_row(name, *(f"{value:.2f}" for value in times.values()), *ratio)
+    console = Console(file=sys.stdout, highlight=False, soft_wrap=True)
+    console.print(table)
+    machine = result["machine"]
+    console.print(f"{machine['cores']} cores of {machine['processor']}, Python {machine['python']}")
+    for name in _FIGURES:
+        console.print(f"{name.replace('_', ' ')}: {result[name]}")
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verbs to the program."""
+    app.command()(compare)
+    app.command()(bench)

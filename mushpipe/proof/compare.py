@@ -1,0 +1,195 @@
+"""Differences between two result recordings, message by message and field by field."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from functools import cache
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import orjson
+
+from mushpipe.core import wire
+from mushpipe.core.errors import InputError, UsageError
+from mushpipe.core.recording import Raw, RecordingReader
+
+Fields = Mapping[str, Any]
+_IMAGE = "foxglove.RawImage"
+_PIXELS = {"mono8": "u1", "rgb8": "u1", "mono16": "<u2", "16UC1": "<u2", "32FC1": "<f4"}
+
+
+class Key(NamedTuple):
+    """What two recordings must both hold to be compared there."""
+
+    topic: str
+    stamp_ns: int
+    sequence: int
+    occurrence: int
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One field of one message that is not the same; ``field`` is empty for a whole message."""
+
+    topic: str
+    field: str
+    sequence: int
+    text: str
+
+
+@dataclass
+class Comparison:
+    """What was compared, and what differs."""
+
+    messages: int = 0
+    topics: set[str] = field(default_factory=set)
+    differences: list[Difference] = field(default_factory=list)
+
+
+def compare(a: Path, b: Path, tolerance: float = 0.0, topics: str = "*") -> Comparison:
+    """Compare two recordings; the time the stages took is left out.
+
+    Messages belong together by topic, sensor time and sequence, in whatever order they stand.
+
+    Args:
+        a: A recording.
+        b: Another.
+        tolerance: Numbers x and y are the same where |x - y| <= tolerance (1 + |y|), images where
+            at most this share of their pixels differs. 0 is exact.
+        topics: Only topics that match, as in a shell.
+
+    Raises:
+        UsageError: There is no such file, or they hold nothing to compare.
+        InputError: One of them cannot be read to its end.
+    """
+    result = Comparison()
+    readers = RecordingReader(a), RecordingReader(b)
+    waiting: tuple[dict[Key, Raw], dict[Key, Raw]] = {}, {}
+    for pair in zip_longest(*(_keyed(reader, topics) for reader in readers)):
+        for side, keyed in enumerate(pair):
+            if keyed is None:
+                continue
+            key, raw = keyed
+            partner = waiting[1 - side].pop(key, None)
+            if partner is None:
+                waiting[side][key] = raw
+                continue
+            result.messages += 1
+            result.topics.add(key.topic)
+            ours, theirs = (raw, partner) if side == 0 else (partner, raw)
+            result.differences += _of_messages(key, ours, theirs, tolerance)
+    for reader, rest in zip(readers, waiting, strict=True):
+        if reader.damage:
+            raise InputError(f"{reader.path} is damaged: {'; '.join(reader.damage)}")
+        text = f"only in {reader.path}"
+        result.differences += [Difference(k.topic, "", k.sequence, text) for k in rest]
+    if not result.messages and not result.differences:
+        raise UsageError(f"{a} and {b} hold nothing on topics '{topics}': nothing was compared")
+    return result
+
+
+def _keyed(reader: RecordingReader, topics: str) -> Iterator[tuple[Key, Raw]]:
+    seen: Counter[tuple[str, int, int]] = Counter()
+    for raw in reader.messages():
+        topic, message = raw.channel.topic, raw.message
+        if topic == wire.TIMING_TOPIC or not fnmatchcase(topic, topics):
+            continue
+        place = (topic, message.publish_time, message.sequence)
+        yield Key(*place, seen[place]), raw
+        seen[place] += 1
+
+
+def _of_messages(key: Key, a: Raw, b: Raw, tolerance: float) -> Iterator[Difference]:
+    if a.message.data == b.message.data:
+        return
+    ours, theirs = _fields(a), _fields(b)
+    for name in ours | theirs:
+        if name not in ours or name not in theirs:
+            text: str | None = f"is only in the {'first' if name in ours else 'second'}"
+        else:
+            text = _difference(ours[name], theirs[name], tolerance)
+        if text:
+            yield Difference(key.topic, name, key.sequence, text)
+
+
+def _fields(raw: Raw) -> dict[str, Any]:
+    """Return every value of a message: an array for an image, else a list for each path."""
+    data = raw.message.data
+    if raw.channel.message_encoding == "json":
+        return _by_path(orjson.loads(data))
+    message = _decoded(raw)
+    if message is None:
+        return {"bytes": [data]}
+    if raw.schema is not None and raw.schema.name == _IMAGE and message.encoding in _PIXELS:
+        pixels = np.frombuffer(message.data, _PIXELS[message.encoding])
+        return {"size": [message.width, message.height, message.encoding], "pixels": pixels}
+    from google.protobuf.json_format import MessageToDict
+
+    # A field that is zero stands in no protobuf message.
+    return _by_path(MessageToDict(message, always_print_fields_with_no_presence=True))
+
+
+@cache
+def _protobuf() -> Any:
+    from mcap_protobuf.decoder import DecoderFactory
+
+    return DecoderFactory()
+
+
+def _decoded(raw: Raw) -> Any:
+    decode = _protobuf().decoder_for(raw.channel.message_encoding, raw.schema)
+    return decode(raw.message.data) if decode else None
+
+
+def _by_path(value: Any) -> dict[str, list[Any]]:
+    """Flatten nested JSON: all values on one path, whatever their index, form one list."""
+    found: dict[str, list[Any]] = {}
+
+    def walk(item: Any, path: str) -> None:
+        if isinstance(item, dict):
+            for key, inner in item.items():
+                walk(inner, f"{path}.{key}" if path else key)
+        elif isinstance(item, list):
+            found.setdefault(path, [])
+            for inner in item:
+                walk(inner, path)
+        else:
+            found.setdefault(path, []).append(item)
+
+    walk(value, "")
+    return found
+
+
+def _difference(a: Any, b: Any, tolerance: float) -> str | None:
+    """Say how two fields differ; None where they do not."""
+    if isinstance(a, np.ndarray):
+        if len(a) != len(b):
+            return f"{len(a)} pixels against {len(b)}"
+        different = int(np.count_nonzero(a != b))
+        return f"{different} of {len(a)} pixels" if different > tolerance * len(a) else None
+    if len(a) != len(b):
+        return f"{len(a)} values against {len(b)}"
+    x, y = _numbers(a), _numbers(b)
+    if x is None or y is None:
+        return None if a == b else f"{_short(a)} against {_short(b)}"
+    far = ~np.isclose(x, y, rtol=tolerance, atol=tolerance, equal_nan=True)
+    if not far.any():
+        return None
+    worst = int(np.argmax(np.where(far, np.nan_to_num(np.abs(x - y), nan=np.inf), -1)))
+    return f"{far.sum()} of {len(a)} values, at worst {a[worst]} against {b[worst]}"
+
+
+def _numbers(values: list[Any]) -> np.ndarray[Any, np.dtype[np.float64]] | None:
+    if not all(value is None or isinstance(value, int | float) for value in values):
+        return None
+    return np.array([np.nan if value is None else value for value in values], float)
+
+
+def _short(value: Any) -> str:
+    text = str(value)
+    return text if len(text) <= 60 else text[:57] + "..."

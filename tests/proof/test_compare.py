@@ -1,0 +1,136 @@
+"""Two result recordings: what is the same, what is not, and by how much."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mushpipe import InputError, Mask, Picks, Trace
+from mushpipe.core.errors import UsageError
+from mushpipe.proof.compare import compare
+from tests.core.lab import cli
+from tests.io.values import SIZE, make_frame, make_picks, record, trace_of
+
+FRAMES = 3
+
+
+def mask(*pixels: tuple[int, int]) -> Mask:
+    foreground = np.zeros(SIZE[::-1], bool)
+    for row, column in pixels:
+        foreground[row, column] = True
+    return Mask(foreground)
+
+
+def traces(picks: Picks | None = None, segment: Mask | None = None) -> list[Trace]:
+    """Three frames; what is given replaces the result of the last one."""
+    made = [
+        trace_of(make_frame(i), segment=mask((0, 0)), pick=make_picks()) for i in range(FRAMES - 1)
+    ]
+    last = trace_of(
+        make_frame(FRAMES - 1), segment=segment or mask((0, 0)), pick=picks or make_picks()
+    )
+    return [*made, last]
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("base") / "base.mcap", traces())
+
+
+def moved(by_m: float) -> Picks:
+    picks = make_picks()
+    return replace(picks, position=picks.position + np.array([by_m, 0, 0]))
+
+
+def test_a_recording_is_the_same_as_itself_recorded_again(base: Path, tmp_path: Path) -> None:
+    found = compare(base, record(tmp_path / "again.mcap", traces()))
+    assert found.differences == []
+    # calibration once; colour, depth, mask and picks of each frame; times are not compared
+    assert found.messages == 1 + 4 * FRAMES
+    assert "/mushpipe/timing" not in found.topics
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(1e-6, 1e-1), st.floats(1e-6, 1e-1))
+def test_numbers_differ_beyond_the_tolerance_only(
+    base: Path, tmp_path_factory: pytest.TempPathFactory, by_m: float, tolerance: float
+) -> None:
+    path = record(tmp_path_factory.mktemp("moved") / "moved.mcap", traces(moved(by_m)))
+    changed = make_picks().position[0, 0] + by_m
+    beyond = abs(changed - make_picks().position[0, 0]) > tolerance * (1 + abs(changed))
+    found = compare(base, path, tolerance).differences
+    assert [(d.topic, d.field, d.sequence) for d in found] == (
+        [("/mushpipe/pick", "position", 12)] if beyond else []
+    )
+
+
+def test_images_may_differ_in_a_share_of_their_pixels(base: Path, tmp_path: Path) -> None:
+    path = record(tmp_path / "m.mcap", traces(segment=mask((0, 0), (3, 4), (5, 6))))
+    found = compare(base, path).differences
+    assert [(d.topic, d.field) for d in found] == [("/mushpipe/segment", "pixels")]
+    assert found[0].text == "2 of 768 pixels"
+    assert compare(base, path, 2 / 768).differences == []
+    assert len(compare(base, path, 1.9 / 768).differences) == 1
+
+
+def test_unknown_is_the_same_as_unknown_and_nothing_else(base: Path, tmp_path: Path) -> None:
+    picks = make_picks()
+    unknown = replace(picks, diameter=np.array([np.nan, np.nan]))
+    found = compare(base, record(tmp_path / "u.mcap", traces(unknown)), 1.0).differences
+    assert [d.field for d in found] == ["diameter"]
+    assert "0.04 against None" in found[0].text
+
+
+def test_another_number_of_mushrooms_is_told_of(base: Path, tmp_path: Path) -> None:
+    first = {n: v[:1] if isinstance(v, np.ndarray) else v for n, v in vars(make_picks()).items()}
+    found = compare(base, record(tmp_path / "n.mcap", traces(Picks(**first))), 1.0).differences
+    assert ("id", "2 values against 1") in [(d.field, d.text) for d in found]
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_missing_frame_is_named_with_its_file(base: Path, tmp_path: Path, turned: bool) -> None:
+    short = record(tmp_path / "short.mcap", traces()[:-1])
+    found = compare(*((short, base) if turned else (base, short))).differences
+    assert {d.sequence for d in found} == {12}
+    assert {d.text for d in found} == {f"only in {base}"}
+    assert len({d.topic for d in found}) == 4
+
+
+def test_only_the_topics_that_were_asked_for(base: Path, tmp_path: Path) -> None:
+    path = record(tmp_path / "m.mcap", traces(moved(1.0), mask()))
+    found = compare(base, path, topics="/mushpipe/seg*")
+    assert {d.topic for d in found.differences} == found.topics == {"/mushpipe/segment"}
+    with pytest.raises(UsageError, match="nothing was compared"):
+        compare(base, path, topics="/elsewhere")
+
+
+def test_a_damaged_file_is_no_basis_for_a_verdict(base: Path, tmp_path: Path) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(base.read_bytes()[:-200])
+    with pytest.raises(InputError, match=r"cut\.mcap is damaged"):
+        compare(base, cut)
+
+
+def test_the_verb_says_what_differs_and_exits_with_3(
+    base: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = record(tmp_path / "m.mcap", traces(moved(0.25)))
+    assert cli(monkeypatch, "compare", base, path) == 3
+    summary = capsys.readouterr().out.splitlines()
+    assert summary == [
+        "/mushpipe/pick  position: 1 frames differ, first frame 12: "
+        "1 of 6 values, at worst 0.1 against 0.35",
+        "13 messages on 5 topics: 1 differences",
+    ]
+    assert cli(monkeypatch, "compare", base, path, "--long") == 3
+    assert capsys.readouterr().out.startswith("frame    12  /mushpipe/pick  position: 1 of 6")
+    assert cli(monkeypatch, "compare", base, path, "--tol", "0.5") == 0
+    assert capsys.readouterr().out == "13 messages on 5 topics: the same\n"
