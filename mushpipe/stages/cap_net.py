@@ -43,7 +43,7 @@ class CapNet(Stage):
         (8, 45), description="smallest and largest radius, px; the image is scaled to suit"
     )
     min_score: float = Field(
-        0.35, ge=0, le=1, description="smallest score that is kept; chosen on simulated beds"
+        0.43, ge=0, le=1, description="smallest score that is kept; chosen on simulated beds"
     )
     overlap: float = Field(0.4, ge=0, le=1, description="largest IoU of two circles")
     model: GraphPath | None = Field(None, description="another model than the package's, ONNX")
@@ -121,7 +121,9 @@ class CapNet(Stage):
         net = self._load()
         bottom, right = (-n % _BLOCK for n in color.shape[:2])
         padded = cv2.copyMakeBorder(color, 0, bottom, 0, right, cv2.BORDER_REPLICATE)
-        maps = net(cv2.dnn.blobFromImage(padded, 1 / 255), next(iter(net.outputs)))
+        # plane by plane: several times as fast as a transposed copy
+        image = np.multiply(cv2.split(padded), np.float32(1 / 255), dtype=np.float32)
+        maps = net(image[None], next(iter(net.outputs)))
         expected = (1, CHANNELS, *(n // STRIDE for n in padded.shape[:2]))
         if maps.shape != expected:
             raise UsageError(

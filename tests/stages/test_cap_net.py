@@ -9,7 +9,9 @@ from pydantic import ValidationError
 
 from mushpipe import RgbdFrame
 from mushpipe.core.errors import UsageError
-from mushpipe.core.truth import INSTANCES_TOPIC, TRUTH_TOPIC
+from mushpipe.core.recording import RecordingReader
+from mushpipe.core.truth import INSTANCES_TOPIC, TRUTH_TOPIC, Truth
+from mushpipe.core.wire import decode_table
 from mushpipe.sources.mcap import McapSource
 from mushpipe.stages.cap_net import KIND, CapNet
 from tests.stages.frames import iou, simulated
@@ -24,10 +26,12 @@ def first(name: str) -> RgbdFrame:
     return next(iter(McapSource(path=RECORDINGS / f"{name}.mcap").frames()))
 
 
-def score_of(frame: RgbdFrame, stage: CapNet) -> Score:
-    truth, score = frame.attached[TRUTH_TOPIC], Score()
-    score.add(stage.process(frame)[1], truth, counted(truth, *stage.radius_px))
-    return score
+def truth_of(name: str) -> Truth:
+    messages = RecordingReader(RECORDINGS / f"{name}.mcap").messages({TRUTH_TOPIC})
+    raw = next(iter(messages))
+    table = decode_table(raw.schema.name, raw.message.data).table
+    assert isinstance(table, Truth)
+    return table
 
 
 @pytest.mark.parametrize(
@@ -35,11 +39,13 @@ def score_of(frame: RgbdFrame, stage: CapNet) -> Score:
     [("first-bed", 0.9), ("dense", 0.9), ("brown", 0.85), ("tilted", 0.85), ("harsh-light", 0.85)],
 )
 def test_caps_of_scenes_it_never_saw_are_found(name: str, least: float) -> None:
-    assert score_of(first(name), CapNet()).f >= least
+    stage, truth, score = CapNet(), truth_of(name), Score()
+    score.add(stage.process(first(name))[1], truth, counted(truth, *stage.radius_px))
+    assert score.f >= least
 
 
 def test_the_mask_is_where_the_caps_are() -> None:
-    frame = first("first-bed")
+    frame = simulated(31, width=640, height=480, count=60)
     truth, labels = frame.attached[TRUTH_TOPIC], frame.attached[INSTANCES_TOPIC].labels
     mask, _ = CapNet().process(frame)
     caps = np.isin(labels, 1 + np.flatnonzero(truth.radius >= 8))
@@ -56,11 +62,14 @@ def test_a_range_of_larger_caps_is_met_by_scaling_the_image() -> None:
     assert large.scale() < 1
     (_, circles), (mask, found) = stage.process(frame), large.process(twice)
     assert mask.foreground.shape == (960, 1280)
-    away = np.linalg.norm(found.center[:, None] - (2 * circles.center + 0.5)[None], axis=2)
-    near = away.min(axis=1) < 4
-    assert near.mean() > 0.85
-    ratio = found.radius[near] / circles.radius[away.argmin(axis=1)[near]]
-    assert np.median(ratio) == pytest.approx(2, rel=0.04)
+    # near the ends of the range a circle may be in one answer and not in the other
+    sure = (circles.score > 0.8) & (circles.radius > 14) & (circles.radius < 40)
+    center, radius = 2 * circles.center[sure] + 0.5, 2 * circles.radius[sure]
+    away = np.linalg.norm(center[:, None] - found.center[None], axis=2)
+    near = away.min(axis=1) < 5
+    assert near.mean() > 0.9
+    ratio = found.radius[away.argmin(axis=1)[near]] / radius[near]
+    assert np.median(ratio) == pytest.approx(1, rel=0.04)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (5, 70), (33, 65), (130, 31), (240, 320)])

@@ -10,33 +10,42 @@ import argparse
 import json
 from collections import defaultdict
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 
 from mushpipe.sources.mcap import McapSource
 from mushpipe.stages.cap_net import CapNet
-from training import judge as classic
+from mushpipe.stages.phase_hough import PhaseHough
+from training import judge
 from training.field import RANGES, labelled, result
 from training.matching import Score, counted
+from training.net.scenes import varied_cases
 from training.scenes import judging_cases
-from training.verifier import RADII, segmentations
+from training.verifier import NET, RADII, segmentations
 
-CLASSIC = ("image", "depth")
+CLASSIC = {
+    "image": PhaseHough(radius_px=RADII, use_depth=False),
+    "depth": PhaseHough(radius_px=RADII),
+    "image+net": PhaseHough(radius_px=RADII, use_depth=False, use_learned=True),
+    "depth+net": PhaseHough(radius_px=RADII, use_learned=True),
+}
 
 
 def simulated(models: list[Path], cache: Path, peers: bool) -> str:
-    """Return the table of all models, with the classic detector where `peers` says so."""
+    """Return the table of all models; with `peers`, of the classic detector too."""
     nets = {path.stem: CapNet(radius_px=RADII, model=path) for path in models}
     scores: dict[tuple[str, str], Score] = defaultdict(Score)
-    for case in judging_cases(cache):
+    for case in chain(judging_cases(cache), varied_cases(cache, "b", 16)):
         counts = counted(case.truth, *RADII)
         for name, net in nets.items():
             scores[case.condition, name].add(net.process(case.frame)[1], case.truth, counts)
         if peers:
             frame, mask = segmentations(case.frame)[0]
-            for name in CLASSIC:
-                circles = classic.detect(classic.DETECTORS[name], frame, mask)
+            learned = NET.process(case.frame)[1]
+            for name, stage in CLASSIC.items():
+                circles = stage.process(frame, mask, learned)
                 scores[case.condition, name].add(circles, case.truth, counts)
-    return classic.table(scores, [*nets, *(CLASSIC if peers else ())])
+    return judge.table(scores, [*nets, *(CLASSIC if peers else ())])
 
 
 def real(model: Path, folder: Path) -> Iterator[str]:

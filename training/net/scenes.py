@@ -9,7 +9,7 @@ import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from mushpipe.core.truth import INSTANCES_TOPIC, TRUTH_TOPIC, Ignore, Instances, Truth
 from mushpipe.sources.synthetic import SyntheticSource
+from training.scenes import Case, stored
 
 Floats = NDArray[np.float64]
-TRAINING_SEED, VALIDATION_SEED = 200_000, 300_000
+TRAINING_SEED, VALIDATION_SEED, JUDGING_SEED, VERIFIER_SEED = 200_000, 300_000, 400_000, 500_000
 TRAINING, VALIDATION = 640, 60
 
 
@@ -131,6 +132,14 @@ def pictures(first: int, count: int, cache: Path) -> Iterator[Picture]:
     """Yield the frames of `count` seeds from `first` on."""
     for seed in range(first, first + count):
         yield picture(seed, cache)
+
+
+def varied_cases(cache: Path, family: Literal["a", "b"], count: int) -> Iterator[Case]:
+    """Yield as varied frames with depth: family a for training a verifier, b for judging only."""
+    first = VERIFIER_SEED if family == "a" else JUDGING_SEED
+    for seed in range(first, first + count):
+        drawn = settings(seed) | {"shape_family": family}
+        yield stored(cache / f"varied-{family}-{seed}.pickle", "varied", drawn)
 
 
 def main() -> None:
