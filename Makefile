@@ -72,5 +72,10 @@ train: $(STAMP) system-libraries
 recordings: $(STAMP) system-libraries
 	$(BIN)/python -m mushpipe.sim.recordings
 
+# Results every recording is held to; shows what changes.
+.PHONY: goldens
+goldens: $(STAMP)-dev system-libraries
+	$(BIN)/python -m tests.proof.goldens
+
 clean:
 	rm -rf $(VENV) out failures .mypy_cache .ruff_cache .pytest_cache

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-import threading
 from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
@@ -12,8 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mushpipe.doctor import register as register_doctor
 from mushpipe.evaluate.cli import register as register_eval
 from mushpipe.proof.cli import register as register_proof
+from mushpipe.record import register as register_record
 from mushpipe.robot.commands import app as robot_app
 
 if TYPE_CHECKING:
@@ -38,7 +39,8 @@ SetOption = Annotated[
     typer.Option("--set", metavar="A.B=VALUE", help="change a setting: segment.use=otsu"),
 ]
 SourceOption = Annotated[
-    str | None, typer.Option("--source", help="recording to play, or name of a source plugin")
+    str | None,
+    typer.Option("--source", help="recording to play, source plugin, or - for a stream"),
 ]
 FramesOption = Annotated[int | None, typer.Option("--frames", help="stop after N frames")]
 
@@ -83,25 +85,6 @@ def _compile(graph: Path, overrides: list[Any], source: str | None) -> Plan:
     return plan
 
 
-def _execute(plan: Plan, manifest: Path | None, capsules: Path) -> int:
-    """Run a plan in front of a user; ``manifest`` None writes none. Return the exit code."""
-    from mushpipe.console import interruptible, progress_bar, show_report, stderr
-    from mushpipe.core.run import run as run_plan
-
-    stop = threading.Event()
-    with interruptible(stop), progress_bar() as show:
-        report = run_plan(plan, stop, show, capsules)
-    show_report(report)
-    if manifest is not None and report.exit_code != 2:  # a wrong command line is no run
-        manifest.parent.mkdir(parents=True, exist_ok=True)
-        content = {**report.manifest, "result": report.summary()}
-        manifest.write_text(json.dumps(content, indent=2) + "\n")
-        stderr.print(f"manifest: {manifest}", style="dim")
-    if report.error is not None:
-        stderr.print(f"error: {report.error}", style="bold red", markup=False)
-    return report.exit_code
-
-
 @app.command()
 def run(
     graph: GraphArgument,
@@ -119,7 +102,7 @@ def run(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log more")] = False,
 ) -> None:
     """Run a graph on its source, or on another one given by --source."""
-    from mushpipe.console import set_up_logging
+    from mushpipe.console import execute, set_up_logging
     from mushpipe.core.manifest import manifest_path
 
     set_up_logging(verbose)
@@ -130,7 +113,7 @@ def run(
         if value is not None
     ]
     plan = _compile(graph, [*overrides, *(set_ or [])], source)
-    raise typer.Exit(_execute(plan, manifest or manifest_path(plan), capsules))
+    raise typer.Exit(execute(plan, manifest or manifest_path(plan), capsules).exit_code)
 
 
 @app.command()
@@ -169,28 +152,6 @@ def graph(
 
     plan = _compile(graph, set_ or [], None)
     _out(draw.dot(plan) if output is Drawing.dot else draw.mermaid(plan))
-
-
-@app.command()
-def record(
-    out: Annotated[Path, typer.Option("--out", "-o", help="recording to write")],
-    source: Annotated[str, typer.Option(help="source plugin, or a recording to copy")],
-    set_: SetOption = None,
-    frames: FramesOption = None,
-    jpeg: Annotated[int | None, typer.Option(help="store colour as JPEG of this quality")] = None,
-) -> None:
-    """Record a source, losing nothing."""
-    from mushpipe.console import set_up_logging
-    from mushpipe.core.document import Document
-    from mushpipe.core.graph import compile_document
-    from mushpipe.core.plugins import load_registry
-
-    set_up_logging(False)
-    sink = {"use": "mcap", "path": str(out.absolute()), "jpeg_quality": jpeg, "timing": False}
-    document = Document("record", Path.cwd(), {"mushpipe": 1, "sinks": {"recorder": sink}})
-    limit = [] if frames is None else [(f"source.max_frames={frames}", f"--frames {frames}")]
-    plan = compile_document(document, load_registry(), [*limit, *(set_ or [])], source)
-    raise typer.Exit(_execute(plan, None, Path("failures")))
 
 
 @app.command()
@@ -257,6 +218,8 @@ def plugins_describe(
 
 
 register_eval(app)
+register_record(app)
+register_doctor(app)
 register_proof(app)
 
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -17,7 +19,9 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from mushpipe.core.errors import EXIT_INTERRUPTED
+from mushpipe.core.plan import Plan
 from mushpipe.core.report import RunReport
+from mushpipe.core.run import run
 
 stderr = Console(stderr=True, highlight=False, soft_wrap=True)
 
@@ -55,8 +59,12 @@ def interruptible(stop: threading.Event) -> Iterator[None]:
 
 
 @contextmanager
-def progress_bar() -> Iterator[Any]:
-    """Yield a function that shows a `RunReport`; it shows nothing where stderr is no terminal."""
+def progress_bar(size: Callable[[], int] | None = None) -> Iterator[Any]:
+    """Yield a function that shows a `RunReport`; it shows nothing where stderr is no terminal.
+
+    Args:
+        size: Returns the bytes written so far, where they are to be shown.
+    """
     if not stderr.is_terminal:
         yield None
         return
@@ -68,9 +76,28 @@ def progress_bar() -> Iterator[Any]:
         def show(report: RunReport) -> None:
             rate = report.processed / max(time.monotonic() - started, 1e-9)
             text = f"{report.processed} frames  {rate:.1f} fps  {report.dropped} dropped"
+            text += f"  {size() / 1e6:.1f} MB" if size else ""
             bar.update(task, description=text)
 
         yield show
+
+
+def execute(
+    plan: Plan, manifest: Path | None, capsules: Path, size: Callable[[], int] | None = None
+) -> RunReport:
+    """Run a plan in front of a user; ``manifest`` None writes none, ``size`` see above."""
+    stop = threading.Event()
+    with interruptible(stop), progress_bar(size) as show:
+        report = run(plan, stop, show, capsules)
+    show_report(report)
+    if manifest is not None and report.exit_code != 2:  # a wrong command line is no run
+        manifest.parent.mkdir(parents=True, exist_ok=True)
+        content = {**report.manifest, "result": report.summary()}
+        manifest.write_text(json.dumps(content, indent=2) + "\n")
+        stderr.print(f"manifest: {manifest}", style="dim")
+    if report.error is not None:
+        stderr.print(f"error: {report.error}", style="bold red", markup=False)
+    return report
 
 
 def durations_table(report: RunReport) -> Table:

@@ -10,7 +10,8 @@ from typing import Any
 from mushpipe.core.document import Document
 from mushpipe.core.errors import UsageError
 from mushpipe.core.plan import Node, Plan
-from mushpipe.core.recording import GRAPH, RecordingReader, RecordingWriter
+from mushpipe.core.recorder import RecordingWriter
+from mushpipe.core.recording import GRAPH, RecordingReader
 from mushpipe.core.types import RgbdFrame
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import islice
 from typing import Any
 
@@ -28,6 +30,17 @@ def failure(node: Node, sequence: int | None, error: BaseException) -> StageErro
     return StageError(f"{node.kind} '{node.name}' ({node.use}) failed{at}: {text}", code)
 
 
+def limited(frames: Iterator[RgbdFrame], source: Source) -> Iterator[RgbdFrame]:
+    """Yield frames up to the source's ``max_frames`` and ``max_seconds``."""
+    end_ns: float = math.inf
+    for frame in islice(frames, source.max_frames):
+        if source.max_seconds is not None and end_ns == math.inf:
+            end_ns = frame.header.stamp_ns + source.max_seconds * 1e9
+        if frame.header.stamp_ns >= end_ns:
+            return
+        yield frame
+
+
 def paced(frames: Iterator[RgbdFrame], speed: float, stop: threading.Event) -> Iterator[RgbdFrame]:
     """Yield frames at their recorded pace times ``speed``; 0 does not wait."""
     first: tuple[int, float] | None = None
@@ -47,6 +60,26 @@ def timed(frames: Iterator[RgbdFrame], durations: Durations) -> Iterator[RgbdFra
         durations.add(time.perf_counter_ns() - begin)
         yield frame
         begin = time.perf_counter_ns()
+
+
+@contextmanager
+def interruptible_opening(source: Source, stop: threading.Event) -> Iterator[None]:
+    """Interrupt a source that waits in its ``open``, when the run is to stop."""
+    opened = threading.Event()
+
+    def watch() -> None:
+        while not opened.wait(0.1):
+            if stop.is_set():
+                source.interrupt()
+                return
+
+    watcher = threading.Thread(target=watch, name="mushpipe-opening", daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        opened.set()
+        watcher.join()
 
 
 class SourceThread(threading.Thread):
@@ -81,7 +114,7 @@ class SourceThread(threading.Thread):
         frames = self.source.frames()
         timed_frames = timed(frames, self.durations)
         try:
-            for frame in islice(paced(timed_frames, speed, self.stop), self.source.max_frames):
+            for frame in limited(paced(timed_frames, speed, self.stop), self.source):
                 if self.stop.is_set() or not self.box.put(frame):
                     break
         finally:
@@ -121,7 +154,8 @@ class SinkThread(threading.Thread):
                 in_a_row += 1
                 if in_a_row >= self.tolerant:
                     self.error = failure(self.node, frame.header.sequence, error)
-                    self.failed_frame = frame
+                    if not isinstance(error, MushpipeError):  # not a full disk, for instance
+                        self.failed_frame = frame
                     self.box.close()
                     return
 

@@ -112,7 +112,9 @@ def _entries(document: Document) -> dict[Kind, list[tuple[Location, dict[str, An
 def _replace_source(document: Document, source: str, registry: Registry) -> None:
     is_name = ("source", source) in registry.entries and not Path(source).exists()
     given = {"use": "mcap", "path": source}
-    if is_name:
+    if source == "-":
+        given = {"use": "stream"}
+    elif is_name or ".py:" in source:
         given = {"use": source}
     elif source.endswith(".bag"):
         given = {"use": "realsense", "file": source}
@@ -187,7 +189,8 @@ def _node(
         return None
     if ".py:" in use:
         use = str((base / use).resolve())
-    return Node(str(at[-1]), kind, use, plugin, ports, dict(inputs), delivery)
+    paths = {k: str(v) for k, v in settings.items() if isinstance(getattr(plugin, k), Path)}
+    return Node(str(at[-1]), kind, use, plugin, ports, dict(inputs), delivery, paths=paths)
 
 
 def _drop_foreign(

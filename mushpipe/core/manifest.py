@@ -18,9 +18,12 @@ def build_manifest(plan: Plan) -> dict[str, Any]:
     """Describe a run before it starts, as plain data without any wall-clock time."""
     source = plan.source.plugin
     files = source.files() if isinstance(source, Source) else ()
+    graph = plan.resolved()
+    for node in plan.sinks:  # in which folder a result was written is none of its content
+        graph["sinks"][node.name] |= node.paths
     return {
         "graph_file": plan.file,
-        "graph": plan.resolved(),
+        "graph": graph,
         "overrides": list(plan.overrides),
         "seed": plan.seed,
         "recordings": [_describe(path) for path in files],

@@ -18,7 +18,10 @@ class Link(NamedTuple):
 
 @dataclass
 class Node:
-    """A configured plugin in a graph; ``links`` is filled by the wiring."""
+    """A configured plugin in a graph; ``links`` is filled by the wiring.
+
+    ``paths`` are its path settings as the user wrote them; the plugin has them resolved.
+    """
 
     name: str
     kind: Kind
@@ -28,6 +31,7 @@ class Node:
     asked: dict[str, str] = field(default_factory=dict)
     delivery: Literal["every", "latest"] | None = None
     links: dict[str, Link] = field(default_factory=dict)
+    paths: dict[str, str] = field(default_factory=dict)
 
     def resolved(self) -> dict[str, Any]:
         """Return the node's entry in a graph file, with every setting written out."""

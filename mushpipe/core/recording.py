@@ -1,4 +1,4 @@
-"""Reading and writing MCAP files; a damaged file is read as far as it goes."""
+"""Reading MCAP files; a damaged file is read as far as it goes."""
 
 from __future__ import annotations
 
@@ -6,27 +6,23 @@ import os
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple
 
 from mcap.exceptions import InvalidMagic, McapError
 from mcap.reader import SeekingReader
 from mcap.records import Attachment, Channel, Chunk, DataEnd, McapRecord, Metadata, Schema
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader, breakup_chunk
-from mcap.writer import CompressionType, Writer
 from zstandard import ZstdError
 
-from mushpipe.core import wire
 from mushpipe.core.errors import InputError, UsageError
-from mushpipe.core.geometry import Camera
-from mushpipe.core.types import Header, RgbdFrame
 
 # What mcap's reader raises on bytes that are not what they claim to be.
-_GARBAGE = (
+GARBAGE = (
     *(McapError, ValueError, struct.error, ZstdError, RuntimeError, MemoryError, TypeError),
     *(OverflowError, LookupError, OSError),
 )
@@ -138,7 +134,7 @@ class RecordingReader:
                         yield from self._unpack(record)
             except InvalidMagic:
                 self._note("its last bytes are missing")
-            except _GARBAGE:
+            except GARBAGE:
                 self._note("it breaks off: the recorder did not close it, or bytes are missing")
 
     def _unpack(self, chunk: Chunk) -> list[McapRecord]:
@@ -146,7 +142,7 @@ class RecordingReader:
             if chunk.uncompressed_size > 2**32:
                 raise ValueError("implausible size")
             records = breakup_chunk(chunk, validate_crc=True)
-        except _GARBAGE as error:
+        except GARBAGE as error:
             self._note(f"a chunk is corrupt ({error})")
             return []
         # Only messages move, and all to the end: a channel is always known before its messages.
@@ -163,7 +159,7 @@ class RecordingReader:
         if self._index is None:
             try:
                 self._index = self._index_from_summary()
-            except _GARBAGE:
+            except GARBAGE:
                 self._index = self._index_by_scan()
         return self._index
 
@@ -219,79 +215,3 @@ class RecordingReader:
             elif isinstance(record, Attachment):
                 index.attachments.append(record.name)
         return index
-
-
-class RecordingWriter:
-    """Writes an MCAP file of zstd chunks of 1 MiB with CRCs; a topic gets its channel on first use.
-
-    A killed process loses at most the open chunk.
-    """
-
-    def __init__(self, path: Path, metadata: Mapping[str, Mapping[str, str]]) -> None:
-        self._file = path.open("wb")
-        self._writer = Writer(self._file, compression=CompressionType.ZSTD, enable_crcs=True)
-        self._writer.start(profile="mushpipe", library="mushpipe")
-        self._schemas: dict[tuple[str, str], int] = {}
-        self._channels: dict[tuple[str, str, tuple[tuple[str, str], ...]], int] = {}
-        self._camera: Camera | None = None
-        for name, values in metadata.items():
-            self.metadata(name, values)
-
-    def metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Write a metadata record at this place of the file."""
-        self._writer.add_metadata(name, dict(values))
-
-    def frame(self, frame: RgbdFrame, jpeg_quality: int | None = None) -> None:
-        """Write colour, depth where the frame has it, and the calibration whenever it changes."""
-        header = frame.header
-        if frame.camera is not None and frame.camera != self._camera:
-            self._camera = frame.camera
-            self.write(wire.CAMERA_TOPIC, wire.encode_camera(frame.camera, header), header)
-        self.write(wire.COLOR_TOPIC, wire.encode_color(frame, jpeg_quality), header)
-        if frame.depth is not None:
-            self.write(wire.DEPTH_TOPIC, wire.encode_depth(frame), header)
-        for topic, value in frame.attached.items():
-            self.value(topic, value, header)
-
-    def value(self, topic: str, value: Any, header: Header) -> None:
-        """Write any value that has a wire form.
-
-        Raises:
-            TypeError: It has none.
-        """
-        encoder = wire.encoder_of(type(value))
-        if encoder is None:
-            raise TypeError(f"{type(value).__name__} has no wire form: it is no Columns type")
-        for message in encoder(value, header):
-            self.write(topic + message.suffix, message, header)
-
-    def write(self, topic: str, message: wire.Message, header: Header) -> None:
-        """Write a message: publish time is sensor time, log time is the host's arrival time."""
-        self._writer.add_message(
-            self._channel(topic, message),
-            log_time=header.arrival_ns,
-            data=message.data,
-            publish_time=header.stamp_ns,
-            sequence=header.sequence,
-        )
-
-    def _channel(self, topic: str, message: wire.Message) -> int:
-        schema = message.schema
-        key = (topic, schema.name, tuple(sorted(message.metadata.items())))
-        if key not in self._channels:
-            schema_key = (schema.name, schema.encoding)
-            if schema_key not in self._schemas:
-                self._schemas[schema_key] = self._writer.register_schema(*schema_key, schema.data)
-            self._channels[key] = self._writer.register_channel(
-                topic, schema.message_encoding, self._schemas[schema_key], dict(message.metadata)
-            )
-        return self._channels[key]
-
-    def flush(self) -> None:
-        """End the open chunk and write all so far, so that a killed process loses none of it."""
-        self._writer.flush()  # type: ignore[no-untyped-call]
-
-    def close(self) -> None:
-        """Write index and footer; the file is complete only after this."""
-        self._writer.finish()  # type: ignore[no-untyped-call]
-        self._file.close()

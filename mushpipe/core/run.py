@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from mushpipe.core.capsule import write_capsule
-from mushpipe.core.edges import SinkThread, SourceThread, failure
+from mushpipe.core.edges import SinkThread, SourceThread, failure, interruptible_opening
 from mushpipe.core.errors import MushpipeError, StageError, UsageError
 from mushpipe.core.manifest import build_manifest
 from mushpipe.core.plan import Link, Node, Plan
@@ -64,8 +64,7 @@ class _Runner:
         self.capsules = capsules
         nodes = (plan.source, *plan.stages, *plan.sinks)
         self.report = RunReport(durations={node.name: Durations() for node in nodes})
-        on_error = plan.on_error or ("fail" if plan.replay() else "skip")
-        self.tolerance = plan.max_failures if on_error == "skip" else 1
+        self.tolerance = 1
         self.started = time.monotonic()
         self.saved: set[str] = set()  # nodes with a failure capsule
 
@@ -73,21 +72,14 @@ class _Runner:
         source = self.plan.source.plugin
         if not isinstance(source, Source):
             raise TypeError("the plan's source is not a Source")
-        reader = SourceThread(
-            self.plan.source,
-            source,
-            threading.Event(),
-            self.report.durations[self.plan.source.name],
-        )
         with _named(self.plan.source):
             self.report.manifest = build_manifest(self.plan)
-            info = RunInfo(
-                source.name(), self.report.manifest, source.live, lambda: reader.box.accepted
-            )
-            self._spare_the_recording(source, info)
         with ExitStack() as stack:
-            stack.enter_context(_opened(self.plan.source, _opener(self.plan.source)))
-            info = self._with_device(source, info)
+            with interruptible_opening(source, self.stop):
+                stack.enter_context(_opened(self.plan.source, _opener(self.plan.source)))
+            durations = self.report.durations[self.plan.source.name]
+            reader = SourceThread(self.plan.source, source, threading.Event(), durations)
+            info = self._begin(source, reader)
             for node in self.plan.stages:
                 stack.enter_context(_opened(node, _opener(node)))
             for node in self.plan.sinks:
@@ -101,11 +93,17 @@ class _Runner:
                 self._wind_up(reader, source, threads)
             self._finish(threads)
 
-    def _with_device(self, source: Source, info: RunInfo) -> RunInfo:
+    def _begin(self, source: Source, reader: SourceThread) -> RunInfo:
+        """Return what the sinks are told, now that the source is open."""
+        on_error = self.plan.on_error or ("fail" if self.plan.replay() else "skip")
+        self.tolerance = self.plan.max_failures if on_error == "skip" else 1
         with _named(self.plan.source):
             self.report.device = source.describe()
-        device = {"device": self.report.device} if self.report.device else {}
-        return replace(info, manifest={**info.manifest, **device})
+            device = {"device": self.report.device} if self.report.device else {}
+            manifest = {**self.report.manifest, **device}
+            info = RunInfo(source.name(), manifest, source.live, lambda: reader.box.accepted)
+            self._spare_the_recording(source, info)
+        return info
 
     def _spare_the_recording(self, source: Source, info: RunInfo) -> None:
         """Raise UsageError where a sink would write over the recording that is played."""
@@ -138,9 +136,9 @@ class _Runner:
             thread.start()
         failures_in_a_row = 0
         while not reader.box.finished and not any(thread.error for thread in threads):
+            # Looked at after the loop again: an interrupted source may have ended by itself.
             if self.stop.is_set():
-                self.report.interrupted = True
-                return
+                break
             frame = reader.box.get(timeout=0.1)
             if frame is None:
                 continue
@@ -162,6 +160,7 @@ class _Runner:
             self.report.dropped = reader.box.dropped
             if self.progress:
                 self.progress(self.report)
+        self.report.interrupted = self.stop.is_set()
 
     def _wind_up(self, reader: SourceThread, source: Source, threads: list[SinkThread]) -> None:
         """Stop the threads, let the sinks finish what they were handed, and settle the counts."""
@@ -202,7 +201,8 @@ class _Runner:
                 raise failed from error
             durations[node.name] = time.perf_counter_ns() - begin
             self.report.durations[node.name].add(durations[node.name])
-        self.report.frame.add(sum(durations.values()))
+        if durations:  # a recorder has no stages whose time could be told
+            self.report.frame.add(sum(durations.values()))
         return Trace(frame, outputs, durations)
 
     def _call(

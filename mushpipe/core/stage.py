@@ -21,7 +21,13 @@ Kind = Literal["stage", "source", "sink"]
 _METHODS: dict[Kind, str] = {"stage": "process", "source": "frames", "sink": "consume"}
 
 
+STDIO = Path("-")
+"""In place of a file: standard output."""
+
+
 def _resolve(path: Path, info: ValidationInfo) -> Path:
+    if path == STDIO:
+        return path
     context = info.context or {}
     from_shell = info.field_name in context.get("from_shell", ())
     return Path(os.path.normpath(Path("" if from_shell else context.get("base", "")) / path))
@@ -77,10 +83,16 @@ class Source(Plugin):
     """Where frames come from."""
 
     max_frames: int | None = Field(None, ge=1, description="stop after so many frames")
+    max_seconds: float | None = Field(
+        None, gt=0, description="stop after so many seconds, by the stamps of the frames"
+    )
 
     @property
     def live(self) -> bool:
-        """Whether frames come when they come, so that a late one is dropped, never waited for."""
+        """Whether frames come when they come, so that a late one is dropped, never waited for.
+
+        Asked for when the source is open.
+        """
         return False
 
     def name(self) -> str:

@@ -169,6 +169,7 @@ def _encode_table(table: Columns, header: Header) -> Iterator[Message]:
 
 
 _ENCODERS: dict[type, Encoder] = {
+    Message: lambda message, _: iter((message,)),  # of a recording, passed on as it is
     RgbdFrame: _encode_frame,
     Mask: _encode_mask,
     Instances: _encode_instances,

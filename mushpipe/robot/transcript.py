@@ -16,7 +16,8 @@ import orjson
 
 from mushpipe.core import wire
 from mushpipe.core.errors import InputError
-from mushpipe.core.recording import RecordingReader, RecordingWriter
+from mushpipe.core.recorder import RecordingWriter
+from mushpipe.core.recording import RecordingReader
 from mushpipe.core.types import Header
 from mushpipe.robot.clock import Clock
 from mushpipe.robot.connection import Kind

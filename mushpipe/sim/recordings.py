@@ -16,7 +16,8 @@ from typing import Any
 import yaml
 
 from mushpipe.core.errors import MushpipeError, UsageError, suggest
-from mushpipe.core.recording import MANIFEST, RecordingWriter
+from mushpipe.core.recorder import RecordingWriter
+from mushpipe.core.recording import MANIFEST
 from mushpipe.sources.synthetic import SyntheticSource
 
 JPEG_QUALITY = 92

@@ -5,14 +5,17 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Mapping
+from glob import escape
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from pydantic import Field, PrivateAttr
+from pydantic import ByteSize, Field, PrivateAttr
 
 from mushpipe import GraphPath, RunInfo, Sink, Trace
 from mushpipe.core import wire
-from mushpipe.core.recording import MANIFEST, SUMMARY, RecordingWriter
+from mushpipe.core.recorder import RecordingWriter
+from mushpipe.core.recording import MANIFEST, SUMMARY
+from mushpipe.core.stage import STDIO
 
 logger = logging.getLogger("mushpipe")
 
@@ -31,24 +34,42 @@ class McapSink(Sink):
         None, ge=1, le=100, description="store colour as JPEG of this quality; lossless if not set"
     )
     timing: bool = Field(True, description="record the time each stage took")
+    split_size: ByteSize | None = Field(
+        None, ge=1, description="begin a new file when one has this size, 2GB say; each is complete"
+    )
 
+    _run: RunInfo | None = PrivateAttr(None)
+    _part: int = PrivateAttr(0)
     _writer: RecordingWriter | None = PrivateAttr(None)
     _unknown: set[type] = PrivateAttr(default_factory=set)
 
     def files(self, run: RunInfo) -> tuple[Path, ...]:
-        """Return the file it writes."""
-        return (run.path(self.path),)
+        """Return the files it writes; of a split recording the first one and all there are."""
+        if self.path == STDIO:
+            return ()
+        path = run.path(self.path)
+        if self.split_size is None:
+            return (path,)
+        parts = path.parent.glob(f"{escape(path.stem)}_[0-9]*{path.suffix}")
+        return tuple(sorted({part(path, 0), *parts}))
 
     def open(self, run: RunInfo) -> None:
         """Create the file and write the manifest."""
+        self._run, self._part = run, 0
+        self._writer = self._begin(run)
+
+    def _begin(self, run: RunInfo) -> RecordingWriter:
+        path = self.path if self.path == STDIO else run.path(self.path)
+        if self.split_size is not None and path != STDIO:
+            path = part(path, self._part)
         manifest = {"json": json.dumps(dict(run.manifest))}
-        self._writer = RecordingWriter(run.path(self.path), {MANIFEST: manifest})
+        if path == STDIO and run.live:
+            manifest["live"] = "true"
+        return RecordingWriter(path, {MANIFEST: manifest})
 
     def consume(self, trace: Trace) -> None:
         """Write one frame and its results."""
-        writer, frame = self._writer, trace.frame
-        if writer is None:
-            raise RuntimeError("the sink is not open")
+        writer, frame = self._next_writer(), trace.frame
         if self.frames:
             writer.frame(frame, self.jpeg_quality)
         for stage in trace.durations_ns:
@@ -58,6 +79,19 @@ class McapSink(Sink):
             content = {"stages_ns": dict(trace.durations_ns)}
             message = wire.json_message(wire.TIMING, frame.header, content)
             writer.write(wire.TIMING_TOPIC, message, frame.header)
+
+    def _next_writer(self) -> RecordingWriter:
+        """Return the writer of the part in work, or of a new one where that has its size."""
+        writer, run = self._writer, self._run
+        if writer is None or run is None:
+            raise RuntimeError("the sink is not open")
+        if self.split_size is None or self.path == STDIO or writer.size < self.split_size:
+            return writer
+        self._writer = None  # also where no new one can be begun
+        writer.close()
+        self._part += 1
+        self._writer = self._begin(run)
+        return self._writer
 
     def _write(self, writer: RecordingWriter, stage: str, value: Any, trace: Trace) -> None:
         if wire.encoder_of(type(value)) is None:
@@ -81,3 +115,8 @@ class McapSink(Sink):
         if self._writer is not None:
             self._writer.close()
             self._writer = None
+
+
+def part(path: Path, number: int) -> Path:
+    """Return the name of a part of a split recording: ``row-7_000.mcap`` is the first."""
+    return path.with_name(f"{path.stem}_{number:03d}{path.suffix}")

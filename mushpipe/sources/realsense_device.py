@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mushpipe.core.errors import DeviceError, UsageError, suggest
 from mushpipe.core.geometry import Camera
@@ -20,6 +20,10 @@ from mushpipe.core.libraries import import_realsense
 UDEV_RULE = (
     'SUBSYSTEMS=="usb", ATTRS{{idVendor}}=="8086", ATTRS{{idProduct}}=="{product}", '
     'MODE:="0666", GROUP:="plugdev"'
+)
+PERMIT = (
+    "put this line into /etc/udev/rules.d/99-realsense.rules,\n    "
+    "run 'sudo udevadm control --reload-rules && sudo udevadm trigger', plug it in again:"
 )
 USB = Path("/sys/bus/usb/devices")
 _NAMES = {"0aa5": "SR300", "0b48": "SR305"}
@@ -37,8 +41,16 @@ def knows_sr300() -> bool:
     return (major, minor) < (2, 55)
 
 
-def cameras_on_usb(root: Path) -> Iterator[tuple[str, str]]:
-    """Yield product id and name of every RealSense on USB, whether it can be opened or not."""
+class UsbCamera(NamedTuple):
+    """A camera as the kernel sees it; ``node`` is the file that a program has to open."""
+
+    product: str
+    name: str
+    node: Path
+
+
+def cameras_on_usb(root: Path) -> Iterator[UsbCamera]:
+    """Yield every RealSense on USB, whether it can be opened or not."""
     for folder in sorted(root.glob("*")):
         with suppress(OSError):  # a device may vanish while it is looked at
             if (folder / "idVendor").read_text().strip() != "8086":
@@ -47,17 +59,18 @@ def cameras_on_usb(root: Path) -> Iterator[tuple[str, str]]:
             with suppress(OSError):
                 name = (folder / "product").read_text().strip()
             if product in _NAMES or "realsense" in name.lower():
-                yield product, _NAMES.get(product, name)
+                bus, number = (int((folder / n).read_text()) for n in ("busnum", "devnum"))
+                node = Path(f"/dev/bus/usb/{bus:03d}/{number:03d}")
+                yield UsbCamera(product, _NAMES.get(product, name), node)
 
 
 def no_camera(root: Path) -> DeviceError:
     """Return the error that says why librealsense sees no camera, as far as that can be told."""
     lines = ["no RealSense camera is connected; plug it into a USB 3 port"]
-    for product, name in cameras_on_usb(root):
+    for product, name, _ in cameras_on_usb(root):
         lines[0] = f"a camera {name} is on USB (8086:{product}), but librealsense cannot open it"
         lines += [
-            "if it is not permitted to, put this line into /etc/udev/rules.d/99-realsense.rules,",
-            "run 'sudo udevadm control --reload-rules && sudo udevadm trigger', plug it in again:",
+            f"if it is not permitted to, {PERMIT}",
             UDEV_RULE.format(product=product),
         ]
         break

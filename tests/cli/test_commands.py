@@ -233,9 +233,11 @@ def test_the_graphs_of_the_project_run(graph: Path, tmp_path: Path) -> None:
 def test_a_recording_is_never_written_over_by_its_own_run(folder: Path) -> None:
     mushpipe("record", "--source", "synthetic", "--frames", 1, "-o", "a.mcap", cwd=folder)
     before = (folder / "a.mcap").read_bytes()
-    done = mushpipe("record", "--source", "a.mcap", "-o", "./a.mcap", cwd=folder)
+    done = mushpipe(
+        *("run", "graph.yaml", "--source", "a.mcap", "--set", "log.path=./a.mcap"), cwd=folder
+    )
     assert done.returncode == EXIT_USAGE
-    assert "sink 'recorder' would write over its own source" in done.stderr
+    assert "sink 'log' would write over its own source" in done.stderr
     assert (folder / "a.mcap").read_bytes() == before
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from mushpipe import Camera, Header, RgbdFrame
 from mushpipe.core.errors import EXIT_DAMAGED, EXIT_OK
-from mushpipe.core.recording import RecordingWriter
+from mushpipe.core.recorder import RecordingWriter
 from tests.cli.test_commands import GRAPH, mushpipe
 from tests.stages.scenes import discs
 

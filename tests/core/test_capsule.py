@@ -9,7 +9,7 @@ from mushpipe import Camera, Circles, RgbdFrame, Sink, Stage
 from mushpipe.core.capsule import capsule_document
 from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.graph import compile_document
-from mushpipe.core.recording import RecordingWriter
+from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.run import run
 from tests.core.lab import Frames, Lab, circles, cli, make_frame
 

@@ -147,7 +147,24 @@ def test_the_resolved_graph_writes_out_inputs_and_delivery(lab: Lab):
     graph = build_manifest(plan)["graph"]
     assert graph["stages"]["a"]["inputs"] == {"frame": "source"}
     assert graph["sinks"]["out"]["delivery"] == "every"
-    assert graph["source"] == {"use": "frames", "max_frames": None, "speed": 0.0, "count": 3}
+    limits = {"max_frames": None, "max_seconds": None}
+    assert graph["source"] == {"use": "frames", **limits, "speed": 0.0, "count": 3}
+
+
+def test_the_manifest_names_results_as_the_user_did_and_the_recording_by_its_place(lab: Lab):
+    lab.registry.sink("mcap", "mushpipe.sinks.mcap:McapSink")
+    plan = lab.compile(
+        """
+        mushpipe: 1
+        source: {use: frames}
+        sinks: {a: {use: mcap, path: "../out/a.mcap"}, b: {use: mcap, path: b.mcap}}
+    """,
+        "b.path=here/b.mcap",
+    )
+    sinks = build_manifest(plan)["graph"]["sinks"]
+    assert (sinks["a"]["path"], sinks["b"]["path"]) == ("../out/a.mcap", "here/b.mcap")
+    resolved = plan.resolved()["sinks"]  # of a capsule, which lies elsewhere
+    assert resolved["a"]["path"] == str(lab.folder.parent / "out/a.mcap")
 
 
 def test_the_manifest_stands_beside_the_first_result(lab: Lab, graph: str):

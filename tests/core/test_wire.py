@@ -12,7 +12,8 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from mushpipe import Camera, Header, Mask, RgbdFrame
 from mushpipe.core import wire
-from mushpipe.core.recording import RecordingReader, RecordingWriter
+from mushpipe.core.recorder import RecordingWriter
+from mushpipe.core.recording import RecordingReader
 from mushpipe.core.truth import Instances
 from tests.core.test_tables import circles, locations, picks, poses, truth
 
@@ -214,10 +215,11 @@ def test_a_frame_of_a_stage_has_topics_of_its_own(written):
     assert [c.topic for c, *_ in rows] == ["/mushpipe/blur/color"]
 
 
-def test_what_is_attached_to_a_frame_is_written_beside_it(written):
+def test_what_is_attached_to_a_frame_is_written_before_its_images(written):
     rows = written(lambda w: w.frame(frame(attached={"/truth/mushrooms": truth()})))
-    assert rows[-1][0].topic == "/truth/mushrooms"
-    assert rows[-1][3]["id"] == [0, 1]
+    topics = [row[0].topic for row in rows]
+    assert topics[-2:] == ["/truth/mushrooms", "/camera/color/image_raw"]
+    assert rows[-2][3]["id"] == [0, 1]
 
 
 def test_a_value_without_wire_form_is_refused(written):

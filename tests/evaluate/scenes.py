@@ -12,7 +12,8 @@ import numpy as np
 from mushpipe import Camera, DepthSource, Header, PickFlag, Picks, RgbdFrame
 from mushpipe.core import wire
 from mushpipe.core.geometry import quaternion_from_axis
-from mushpipe.core.recording import MANIFEST, RecordingWriter
+from mushpipe.core.recorder import RecordingWriter
+from mushpipe.core.recording import MANIFEST
 from mushpipe.core.tables import Locations
 from mushpipe.core.truth import TRUTH_TOPIC, Truth
 

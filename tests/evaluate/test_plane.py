@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from mushpipe import RgbdFrame
 from mushpipe.cli import app
 from mushpipe.core.errors import InputError, UsageError
-from mushpipe.core.recording import RecordingWriter
+from mushpipe.core.recorder import RecordingWriter
 from mushpipe.evaluate.plane import judge_planes, measure_plane, plane_values, window_of
 from tests.evaluate.scenes import frame
 

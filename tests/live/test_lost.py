@@ -224,12 +224,14 @@ def usb(folder: Path, **files: str) -> None:
 def test_a_camera_on_usb_that_may_not_be_opened_is_named_with_the_rule(tmp_path):
     usb(tmp_path / "1-1", idVendor="046d", idProduct="0aa5", product="a mouse")
     usb(tmp_path / "1-2", idVendor="8086", idProduct="8087", product="Bluetooth")
-    usb(tmp_path / "2-1", idVendor="8086", idProduct="0aa5")
-    usb(tmp_path / "2-2", idVendor="8086", idProduct="0b07", product="Intel(R) RealSense(TM) 435")
+    at = {"busnum": "2", "devnum": "14"}
+    usb(tmp_path / "2-1", idVendor="8086", idProduct="0aa5", **at)
+    named = "Intel(R) RealSense(TM) 435"
+    usb(tmp_path / "2-2", idVendor="8086", idProduct="0b07", product=named, **at)
     usb(tmp_path / "usb1")
     assert list(cameras_on_usb(tmp_path)) == [
-        ("0aa5", "SR300"),
-        ("0b07", "Intel(R) RealSense(TM) 435"),
+        ("0aa5", "SR300", Path("/dev/bus/usb/002/014")),
+        ("0b07", "Intel(R) RealSense(TM) 435", Path("/dev/bus/usb/002/014")),
     ]
     assert str(no_camera(tmp_path)).splitlines()[:4] == [
         "a camera SR300 is on USB (8086:0aa5), but librealsense cannot open it",

@@ -1,0 +1,107 @@
+"""How the cost of the chain grows with mushrooms and with pixels: table, exponent, plot.
+
+    python benchmarks/growth.py -o docs/images/growth.png
+
+Beds are simulated with a seed of their own; the camera of n times the pixels sees the same bed.
+The exponent is the slope of log(time) over log(size): 1 is linear.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+
+from mushpipe.core.document import read_document
+from mushpipe.core.graph import compile_document
+from mushpipe.core.plugins import load_registry
+from mushpipe.core.recording import RecordingWriter
+from mushpipe.proof.bench import bench, machine
+from mushpipe.sources.synthetic import SyntheticSource
+
+mpl.use("Agg")
+GRAPH = Path(__file__).resolve().parents[1] / "graphs/pick.yaml"
+SEED = 4711
+COUNTS = (10, 40, 150, 400)
+SIZES = ((320, 240), (640, 480), (1280, 960), (1920, 1080))
+
+
+def measure(folder: Path, frames: int, **scene: Any) -> dict[str, float]:
+    """Return the median time of each stage on one frame of a scene, ms."""
+    path = folder / "scene.mcap"
+    writer = RecordingWriter(path, {})
+    source = SyntheticSource(seed=SEED, max_frames=1, **scene)
+    for frame in source.frames():
+        writer.frame(frame)
+    writer.close()
+    largest = 45 * scene.get("width", 640) / 640
+    overrides = [
+        f"detect.radius_px=[{max(5, largest / 6)},{largest}]",
+        f"log.path={folder / 'log.mcap'}",
+        "source.loop=0",
+    ]
+
+    def plan(count: int) -> Any:
+        limit = f"source.max_frames={count}"
+        return compile_document(
+            read_document(GRAPH), load_registry(), [*overrides, limit], str(path)
+        )
+
+    result = bench(plan, frames)
+    medians = {name: times["p50_ms"] for name, times in result["nodes"].items()}
+    return {**medians, "all stages": result["frame"]["p50_ms"]}
+
+
+def exponent(sizes: list[float], times: list[float]) -> float:
+    """Return the slope of the two largest sizes in log-log."""
+    (a, b), (s, t) = sizes[-2:], times[-2:]
+    return float(np.log(t / s) / np.log(b / a)) if s and t else float("nan")
+
+
+def table(title: str, sizes: list[float], rows: list[dict[str, float]]) -> None:
+    """Print a table, a row per node."""
+    print(f"\n| {title} |", " | ".join(f"{size:g}" for size in sizes), "| exponent |")
+    print("|---|" + "---|" * (len(sizes) + 1))
+    for name in rows[0]:
+        times = [row[name] for row in rows]
+        cells = [f"{time:.2f}" for time in times]
+        print(f"| {name} |", " | ".join(cells), f"| {exponent(sizes, times):.2f} |")
+
+
+def main() -> None:
+    """Measure, print and draw."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("-o", "--out", type=Path, default=Path("growth.png"))
+    parser.add_argument("--frames", type=int, default=30, help="runs of each scene")
+    arguments = parser.parse_args()
+    print(f"{machine()}; seed {SEED}; ms per frame, median of {arguments.frames}")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(1, 2, figsize=(11, 4.5), sharey=True)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        by_count = [measure(folder, arguments.frames, count=count) for count in COUNTS]
+        by_size = [measure(folder, arguments.frames, width=w, height=h) for w, h in SIZES]
+    pixels = [w * h / 1e6 for w, h in SIZES]
+    for axis, title, sizes, rows in (
+        (axes[0], "mushrooms in view", list(map(float, COUNTS)), by_count),
+        (axes[1], "megapixels", pixels, by_size),
+    ):
+        table(title, sizes, rows)
+        for node in rows[0]:
+            bold = 2.5 if node == "all stages" else 1
+            axis.loglog(sizes, [row[node] for row in rows], "o-", linewidth=bold, label=node)
+        axis.set_xlabel(title)
+        axis.grid(True, which="both", alpha=0.3)
+    axes[0].set_ylabel("ms per frame")
+    axes[1].legend(fontsize="small")
+    figure.tight_layout()
+    figure.savefig(arguments.out, dpi=110)
+
+
+if __name__ == "__main__":
+    main()

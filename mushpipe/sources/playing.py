@@ -1,0 +1,232 @@
+"""Recorded messages to frames: decoded, paired, calibrated and numbered."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Set
+from dataclasses import replace
+from typing import Any, TypeVar
+
+from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoders
+from mcap_ros2.decoder import DecoderFactory as Ros2Decoders
+from pydantic import BaseModel, ConfigDict, Field
+
+from mushpipe.core import wire
+from mushpipe.core.errors import InputError
+from mushpipe.core.geometry import Camera
+from mushpipe.core.recording import Raw
+from mushpipe.core.stage import Source
+from mushpipe.core.types import Header, RgbdFrame
+from mushpipe.sources.images import decode_camera, decode_color, decode_depth
+from mushpipe.sources.pairing import Pairing
+from mushpipe.sources.topics import Topics
+
+T = TypeVar("T")
+logger = logging.getLogger("mushpipe")
+NO_DEPTH = "%s has no depth: positions, distances and diameters will be missing"
+
+
+class Intrinsics(BaseModel):
+    """A pinhole camera without distortion, for recordings that carry no calibration."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    fx: float = Field(gt=0, description="focal length along x, px")
+    fy: float = Field(gt=0, description="focal length along y, px")
+    cx: float = Field(description="principal point, x, px")
+    cy: float = Field(description="principal point, y, px")
+
+
+class RecordedSource(Source):
+    """Settings of every source that reads recorded messages."""
+
+    color_topic: str | None = Field(None, description="colour images; chosen by name if not given")
+    depth_topic: str | None = Field(None, description="depth images aligned to colour")
+    camera_topic: str | None = Field(None, description="calibration of the colour images")
+    use_depth: bool = Field(True, description="false plays colour only")
+    depth_scale: float | None = Field(
+        None, gt=0, description="metres per unit of depth, where the recording does not say it"
+    )
+    pair_tolerance_ms: float = Field(
+        15.0, ge=0, description="largest difference of the stamps of a colour and a depth image"
+    )
+    camera: Intrinsics | None = Field(
+        None, description="intrinsics, in place of those of the recording"
+    )
+
+
+class Player:
+    """Turns messages into frames, of one recording or stream.
+
+    Args:
+        settings: How to decode them.
+        name: What messages call the recording.
+        topics: Which messages are colour, depth and calibration.
+        beside: Topics to pass on with the frame of the same stamp, as they are.
+        numbered: Whether sequence numbers are the frames' own; else they are counted.
+        counts: Where images without a partner and undecodable ones are counted.
+
+    Attributes:
+        camera: The calibration in force.
+        error: The first message that could not be decoded, and why.
+        frames: How many were made.
+    """
+
+    def __init__(
+        self,
+        settings: RecordedSource,
+        name: str,
+        topics: Topics,
+        beside: Set[str],
+        numbered: bool,
+        counts: Counter[str],
+    ) -> None:
+        self.settings = settings
+        self.name = name
+        self.topics = topics
+        self.beside = beside
+        self.numbered = numbered
+        self.counts = counts
+        self.camera: Camera | None = None
+        self.error = ""
+        self.frames = 0
+        self.size: tuple[int, ...] | None = None
+        self._factories = (ProtobufDecoders(), Ros2Decoders())
+        self._found_beside: dict[int, dict[str, wire.Message]] = {}
+
+    def wanted(self) -> set[str]:
+        """Return the topics of the messages that `play` takes."""
+        named = (self.topics.color, self.topics.depth, self.topics.camera)
+        return {topic for topic in named if topic is not None} | self.beside
+
+    def play(self, messages: Iterable[Raw], hold: bool) -> Iterator[RgbdFrame]:
+        """Yield the frames of some messages.
+
+        Args:
+            messages: Of the topics `wanted`, in order.
+            hold: Whether to keep a frame back until the next message of the camera: what belongs
+                to it may come after its images. In a stream, it comes before them.
+        """
+        pairing: Pairing[_Color, _Depth] = Pairing(round(self.settings.pair_tolerance_ms * 1e6))
+        ready: list[RgbdFrame] = []
+        for raw in messages:
+            if raw.channel.topic in self.beside:
+                self._put_beside(raw)
+                continue
+            if not hold:
+                yield from map(self._with_beside, self._take(raw, pairing))
+                continue
+            yield from map(self._with_beside, ready)
+            ready = list(self._take(raw, pairing))
+        yield from map(self._with_beside, (*ready, *self._frames(pairing.finish())))
+        self.counts["colour images without depth"] += pairing.color_alone
+        self.counts["depth images without colour"] += pairing.depth_alone
+
+    def _take(self, raw: Raw, pairing: Pairing[_Color, _Depth]) -> Iterator[RgbdFrame]:
+        if raw.channel.topic == self.topics.camera:
+            self.camera = self.calibration(raw, "calibrations") or self.camera
+        elif raw.channel.topic == self.topics.depth:
+            depth = self._decode(raw, self._depth)
+            if depth:
+                yield from self._frames(pairing.add_depth(depth[0], depth[1]))
+        else:
+            color = self._decode(raw, self._color)
+            if color and self.topics.depth is None:
+                yield self._frame(color, None)
+            elif color:
+                yield from self._frames(pairing.add_color(color[0].stamp_ns, color))
+
+    def _put_beside(self, raw: Raw) -> None:
+        given = raw.schema
+        name, encoding, data = (given.name, given.encoding, given.data) if given else ("", "", b"")
+        schema = wire.Schema(name, encoding, data, raw.channel.message_encoding)
+        message = wire.Message("", schema, raw.message.data, raw.channel.metadata)
+        found = self._found_beside.setdefault(raw.message.publish_time, {})
+        found[raw.channel.topic] = message
+
+    def _with_beside(self, frame: RgbdFrame) -> RgbdFrame:
+        stamp_ns = frame.header.stamp_ns
+        attached = self._found_beside.pop(stamp_ns, {})
+        for passed in [stamp for stamp in self._found_beside if stamp < stamp_ns]:
+            del self._found_beside[passed]
+        return replace(frame, attached=attached) if attached else frame
+
+    def calibration(self, raw: Raw, what: str = "") -> Camera | None:
+        """Decode a calibration; one that cannot be is counted, where ``what`` says as what."""
+        return self._decode(raw, lambda message, _: decode_camera(message), what)
+
+    def _decode(
+        self, raw: Raw, decode: Callable[[Any, Raw], T | None], what: str = "images"
+    ) -> T | None:
+        """Decode a message, or return None and count it where ``what`` says as what."""
+        try:
+            for factory in self._factories:
+                decoder = factory.decoder_for(raw.channel.message_encoding, raw.schema)
+                if decoder is not None:
+                    return decode(decoder(raw.message.data), raw)
+            raise ValueError(f"message encoding '{raw.channel.message_encoding}' is not supported")
+        except Exception as error:  # whatever a decoder makes of foreign bytes
+            if what:
+                self.counts[f"{what} that could not be decoded"] += 1
+            self.error = self.error or f"{raw.channel.topic}: {error}"
+            return None
+
+    def _color(self, message: Any, raw: Raw) -> _Color:
+        stamp_ns, frame_id = _stamp(message, raw)
+        header = Header(stamp_ns, raw.message.sequence, frame_id, raw.message.log_time)
+        return header, decode_color(message)
+
+    def _depth(self, message: Any, raw: Raw) -> tuple[int, _Depth]:
+        stated = raw.channel.metadata.get("depth_scale")
+        scale = self.settings.depth_scale or (float(stated) if stated else None)
+        stamp_ns, frame_id = _stamp(message, raw)
+        return stamp_ns, (frame_id, *decode_depth(message, scale))
+
+    def _frames(self, pairs: Iterator[tuple[_Color, _Depth | None]]) -> Iterator[RgbdFrame]:
+        return (self._frame(color, depth) for color, depth in pairs)
+
+    def _frame(self, color: _Color, depth: _Depth | None) -> RgbdFrame:
+        header, image = color
+        sequence = header.sequence if self.numbered else self.frames
+        header = replace(header, sequence=sequence)
+        self.frames += 1
+        if depth and depth[0] != header.frame_id and "aligned" not in (self.topics.depth or ""):
+            raise InputError(
+                f"{self.name}: depth ({self.topics.depth}) is in frame '{depth[0]}', "
+                f"colour in '{header.frame_id}': depth must be aligned to colour; record "
+                "aligned_depth_to_color, or play without depth: --set source.use_depth=false"
+            )
+        self._watch_size(image.shape[:2], sequence)
+        try:
+            native, scale = depth[1:] if depth else (None, 0.001)
+            return RgbdFrame(header, image, native, scale, self._camera(image.shape[:2]))
+        except ValueError as error:
+            raise InputError(f"{self.name}, frame {sequence}: {error}") from error
+
+    def _camera(self, size: tuple[int, ...]) -> Camera | None:
+        given = self.settings.camera
+        if given is None:
+            return self.camera
+        return Camera(size[1], size[0], given.fx, given.fy, given.cx, given.cy)
+
+    def _watch_size(self, size: tuple[int, ...], sequence: int) -> None:
+        if self.size not in (None, size) and self.size:
+            old, new = (f"{s[1]}x{s[0]}" for s in (self.size, size))
+            logger.warning("the frame size changes from %s to %s at frame %d", old, new, sequence)
+        self.size = size
+
+
+_Color = tuple[Header, Any]
+_Depth = tuple[str, Any, float]
+
+
+def _stamp(message: Any, raw: Raw) -> tuple[int, str]:
+    """Return sensor time and frame; a stamp that was never set gives way to the publish time."""
+    if hasattr(message, "header"):
+        stamp = message.header.stamp
+        nanoseconds, frame_id = stamp.sec * 10**9 + stamp.nanosec, message.header.frame_id
+    else:
+        stamp = message.timestamp
+        nanoseconds, frame_id = stamp.seconds * 10**9 + stamp.nanos, message.frame_id
+    return nanoseconds or raw.message.publish_time, frame_id

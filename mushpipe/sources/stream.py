@@ -1,0 +1,176 @@
+"""Source `stream`: what `mushpipe record -o -` writes, from standard input."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import select
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from io import BufferedReader, RawIOBase
+from itertools import chain, islice
+from typing import Any
+
+from mcap.exceptions import InvalidMagic
+from mcap.records import Channel, McapRecord, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader
+from pydantic import PrivateAttr
+
+from mushpipe.core import wire
+from mushpipe.core.errors import InputError, UsageError
+from mushpipe.core.recording import GARBAGE, MANIFEST, Raw
+from mushpipe.core.types import RgbdFrame
+from mushpipe.sources.playing import NO_DEPTH, Player, RecordedSource
+from mushpipe.sources.topics import Topics
+
+logger = logging.getLogger("mushpipe")
+_POLL_S = 0.1
+_BUFFER = 1 << 20
+
+
+class StreamSource(RecordedSource):
+    """Frames from standard input, in MCAP: of a camera at another computer or another Python.
+
+    `ssh farm mushpipe record -o - | mushpipe run graph.yaml --source -`. Where the sender has a
+    camera, the newest frame is taken; a recording that is sent waits for the graph. Topics are
+    mushpipe's own unless they are named.
+    """
+
+    _number: int = PrivateAttr(0)
+    _records: Iterator[McapRecord] = PrivateAttr(default_factory=lambda: iter(()))
+    _manifest: dict[str, str] = PrivateAttr(default_factory=dict)
+    _counts: Counter[str] = PrivateAttr(default_factory=Counter)
+    _interrupted: threading.Event = PrivateAttr(default_factory=threading.Event)
+
+    @property
+    def live(self) -> bool:
+        """Whether the sender has a camera; known once the stream is open."""
+        return self._manifest.get("live") == "true"
+
+    def name(self) -> str:
+        """Return ``stream``."""
+        return "stream"
+
+    def open(self) -> None:
+        """Wait for the head of the stream.
+
+        Raises:
+            UsageError: Nothing is piped into this program.
+            InputError: Nothing came, or it is no MCAP.
+        """
+        if os.isatty(self._number):
+            raise UsageError(
+                "nothing is piped into this program: 'mushpipe record -o - | mushpipe run GRAPH "
+                "--source -'"
+            )
+        stdin = BufferedReader(_Input(self._number, self._interrupted), _BUFFER)
+        records = StreamReader(stdin, validate_crcs=True).records
+        try:
+            head = list(islice(records, 2))  # the header; the manifest, if mushpipe sends
+        except InvalidMagic as error:
+            raise InputError("standard input is not MCAP: send it with -o -") from error
+        except GARBAGE as error:
+            if self._interrupted.is_set():
+                return
+            raise InputError("standard input is empty: see what its sender says") from error
+        for record in head:
+            if isinstance(record, Metadata) and record.name == MANIFEST:
+                self._manifest = record.metadata
+        self._records = chain(head, records)
+
+    def describe(self) -> dict[str, Any]:
+        """Return what the sender says of its camera."""
+        device = json.loads(self._manifest.get("json", "{}")).get("device", {})
+        return device if isinstance(device, dict) else {}
+
+    def counts(self) -> dict[str, int]:
+        """Return how many images found no partner or could not be decoded."""
+        return {name: count for name, count in sorted(self._counts.items()) if count}
+
+    def interrupt(self) -> None:
+        """Stop waiting for the sender."""
+        self._interrupted.set()
+
+    def frames(self) -> Iterator[RgbdFrame]:
+        """Yield frames until the sender ends the stream.
+
+        Raises:
+            InputError: It broke off, no colour images came, or they do not fit the calibration.
+        """
+        topics = Topics(
+            self.color_topic or wire.COLOR_TOPIC,
+            (self.depth_topic or wire.DEPTH_TOPIC) if self.use_depth else None,
+            self.camera_topic or wire.CAMERA_TOPIC,
+        )
+        reader = _Messages(self._records)
+        messages, head = iter(reader), list[Raw]()
+        for raw in messages:
+            head.append(raw)
+            if raw.channel.topic == topics.depth or _count(head, topics.color) == 2:
+                break
+        if topics.depth not in {raw.channel.topic for raw in head}:
+            topics = replace(topics, depth=None)
+            if head:
+                logger.warning(NO_DEPTH, "the stream")
+        beside = reader.topics - set(vars(topics).values()) if self._manifest else set()
+        player = Player(self, "the stream", topics, beside, bool(self._manifest), self._counts)
+        wanted = player.wanted()
+        known = (raw for raw in chain(head, messages) if raw.channel.topic in wanted)
+        yield from player.play(known, hold=False)
+        if self._interrupted.is_set():
+            return
+        if reader.damage or player.error:
+            damage = player.error or reader.damage
+            raise InputError(f"the stream {damage}; {player.frames} frames came")
+        if not player.frames:
+            found = ", ".join(sorted(reader.topics)) or "nothing"
+            raise InputError(f"the stream has no colour images on {topics.color}, only {found}")
+
+
+def _count(messages: list[Raw], topic: str) -> int:
+    return sum(raw.channel.topic == topic for raw in messages)
+
+
+class _Messages:
+    """The messages of a stream; ``damage`` says afterwards how it ended, if not as it should."""
+
+    def __init__(self, records: Iterator[McapRecord]) -> None:
+        self._records = records
+        self.damage = ""
+        self.topics: set[str] = set()
+
+    def __iter__(self) -> Iterator[Raw]:
+        channels: dict[int, Channel] = {}
+        schemas: dict[int, Schema] = {}
+        try:
+            for record in self._records:
+                if isinstance(record, Schema):
+                    schemas[record.id] = record
+                elif isinstance(record, Channel):
+                    channels[record.id] = record
+                    self.topics.add(record.topic)
+                elif isinstance(record, Message):
+                    channel = channels[record.channel_id]
+                    yield Raw(channel, schemas.get(channel.schema_id), record)
+        except GARBAGE as error:
+            self.damage = f"broke off: its sender did not end it ({type(error).__name__})"
+
+
+class _Input(RawIOBase):
+    """A file descriptor, read without a lock that would hang the end of the program."""
+
+    def __init__(self, number: int, interrupted: threading.Event) -> None:
+        self._number = number
+        self._interrupted = interrupted
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        while not self._interrupted.is_set():
+            if select.select([self._number], [], [], _POLL_S)[0]:
+                return os.readv(self._number, [buffer])
+        return 0

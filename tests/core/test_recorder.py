@@ -1,0 +1,71 @@
+"""Writing recordings: what happens when no more can be written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from mushpipe.core.recorder import RecordingError, RecordingWriter
+from mushpipe.core.recording import RecordingReader
+from mushpipe.core.wire import COLOR_TOPIC
+from tests.io.values import make_frame
+
+SIZE = (160, 120)
+
+
+class Disk:
+    """A file on a disk that is full for a while."""
+
+    def __init__(self, path: Path, room: int) -> None:
+        self.file = path.open("wb", buffering=0)
+        self.room = room
+
+    def write(self, data: memoryview) -> int:
+        if not self.room:
+            raise OSError(28, "No space left on device")
+        written = self.file.write(data[: self.room])
+        self.room -= written
+        return written
+
+    def close(self) -> None:
+        self.file.close()
+
+
+@pytest.mark.parametrize("room", [1_300_000, 2_345_678])
+def test_after_a_full_disk_nothing_is_written_even_when_there_is_room_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int
+) -> None:
+    """What follows a torn chunk could not be read; so the file ends with it."""
+    path = tmp_path / "out.mcap"
+    disk = Disk(path, room)
+    monkeypatch.setattr("mushpipe.core.recorder._create", lambda _: disk)
+    writer = RecordingWriter(path, {"note": {"a": "b"}})
+    written = 0
+
+    def record() -> None:
+        nonlocal written
+        while True:
+            writer.frame(make_frame(written, SIZE))
+            written += 1
+
+    with pytest.raises(RecordingError) as caught:
+        record()
+    told = f"{path}: No space left on device; it plays up to its last whole chunk"
+    assert str(caught.value) == told
+    disk.room = 10**9
+    for _ in range(3):
+        with pytest.raises(RecordingError, match="No space left"):
+            writer.metadata("more", {})
+    writer.close()
+    assert disk.file.closed
+    assert path.stat().st_size == room
+    reader = RecordingReader(path)
+    frames = sum(raw.channel.topic == COLOR_TOPIC for raw in reader.messages())
+    assert 0 < frames <= written + 1
+    assert reader.damage == ["it breaks off: the recorder did not close it, or bytes are missing"]
+
+
+def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"cannot be written: Is a directory"):
+        RecordingWriter(tmp_path, {})
