@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import expit
@@ -34,7 +35,7 @@ from training.scenes import Case, training_cases
 Floats = NDArray[np.float64]
 RADII = (8.0, 45.0)
 Prepared = tuple[Case, RgbdFrame, Mask, Circles | None]
-VARIED = 40  # frames
+VARIED = 20  # frames
 NET = CapNet(radius_px=RADII, min_score=0.05)  # what it is unsure of is for the verifier to decide
 MODELS: dict[str, dict[str, Any]] = {
     "image": {"use_depth": False},
@@ -69,15 +70,17 @@ def segmentations(frame: RgbdFrame) -> list[tuple[RgbdFrame, Mask]]:
 
 
 def prepared(cache: Path) -> Iterator[Prepared]:
-    """Yield the frames of the training: segmented in two ways, and as `cap-net` hands them on.
+    """Yield the frames of the training, without and with the circles of `cap-net`.
 
     What is learnt beside `cap-net` is learnt on varied frames as well, as that is what it is for.
     """
     for case in training_cases(cache):
-        yield from ((case, frame, mask, None) for frame, mask in segmentations(case.frame))
-        yield (case, case.frame, *NET.process(case.frame))
+        for number, (frame, mask) in enumerate(segmentations(case.frame)):
+            yield case, frame, mask, None
+            if number == 0:
+                yield case, frame, mask, NET.process(case.frame)[1]
     for case in varied_cases(cache, "a", VARIED):
-        yield (case, case.frame, *NET.process(case.frame))
+        yield case, *segmentations(case.frame)[0], NET.process(case.frame)[1]
 
 
 def labels(case: Case, circles: Circles, order: NDArray[np.intp]) -> Floats:
@@ -167,14 +170,16 @@ def write(models: dict[str, Any], path: Path) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def train(cache: Path, out: Path, rounds: int, ridge: float) -> None:
-    """Train all models and write them."""
+def train(cache: Path, out: Path, rounds: int, ridge: float, names: list[str]) -> None:
+    """Train the models of these names and write them, beside the others that the file has."""
     cases = [*prepared(cache)]
-    models = {name: first_guess() for name in MODELS}
+    kept = yaml.safe_load(out.read_text(encoding="utf-8"))["models"] if out.exists() else {}
+    models = {name: first_guess() for name in MODELS} | kept
+    models |= {name: first_guess() for name in names}
     write(models, out)
     for turn in range(rounds):
-        for name, settings in MODELS.items():
-            stage = PhaseHough(radius_px=RADII, verifier=out, **settings)
+        for name in names:
+            stage = PhaseHough(radius_px=RADII, verifier=out, **MODELS[name])
             beside = name.endswith("learned")
             chosen = [case for case in cases if (case[3] is not None) == beside]
             features, right = samples(stage, chosen, name.startswith("depth"))
@@ -190,8 +195,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("mushpipe/stages/verifier.yaml"))
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--ridge", type=float, default=1e-3)
+    parser.add_argument("--models", nargs="+", default=list(MODELS), choices=MODELS)
     arguments = parser.parse_args()
-    train(arguments.cache, arguments.out, arguments.rounds, arguments.ridge)
+    names = arguments.models
+    train(arguments.cache, arguments.out, arguments.rounds, arguments.ridge, names)
 
 
 if __name__ == "__main__":

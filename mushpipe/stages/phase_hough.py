@@ -25,7 +25,7 @@ from mushpipe.stages.phase_edges import (
 )
 from mushpipe.stages.phase_features import LEARNED, NAMES, static_features
 from mushpipe.stages.phase_fuse import fused
-from mushpipe.stages.phase_learned import agreement, candidates_of
+from mushpipe.stages.phase_learned import agreement, candidates_of, discs_of
 from mushpipe.stages.phase_refit import Table, refit
 from mushpipe.stages.phase_votes import CELL, peaks, rings_between, summed, vote
 from mushpipe.stages.verifier import Verifier, load_verifier
@@ -144,7 +144,10 @@ class PhaseHough(Stage):
         smallest, largest = self._range(relief, height, width)
         image = _levels(frame, mask, literal)
         gradient = gradient_of(image)
-        edges = self._edges(image, gradient, _region(mask, relief, literal), relief)
+        region = _region(mask, relief, literal)
+        if learned is not None:
+            region = region | discs_of(learned, region.shape)
+        edges = self._edges(image, gradient, region, relief)
         cells = vote(
             edges, rings_between(smallest, largest), (-(-height // CELL), -(-width // CELL))
         )
