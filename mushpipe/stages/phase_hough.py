@@ -220,10 +220,11 @@ class PhaseHough(Stage):
         from mushpipe import Camera, Header
 
         camera = Camera(96, 96, 100.0, 100.0, 47.5, 47.5)
+        learned = Circles(np.array([[48.0, 48.0]]), np.array([20.0]), np.ones(1))
         for native in (np.uint16, np.float32):
             depth = (500 - 20 * disc).astype(native)
             frame = RgbdFrame(Header(0, 0, "warm-up"), color, depth, 0.001, camera)
-            self.process(frame, Mask(disc))
+            self.process(frame, Mask(disc), learned)
 
 
 def equal_area_radius(shapes: Table) -> Table:

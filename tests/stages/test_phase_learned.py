@@ -29,9 +29,10 @@ def test_candidates_are_the_circles_of_the_range() -> None:
 
 
 def test_without_circles_use_learned_says_what_is_missing() -> None:
-    image = discs([(60, 60, 20)], 0.8, 0.1)
+    image, stage = discs([(60, 60, 20)], 0.8, 0.1), PhaseHough(use_learned=True)
+    stage.open()
     with pytest.raises(InputError, match="needs a stage above that finds circles"):
-        PhaseHough(use_learned=True).process(frame_of(image), Mask(image > 0.5))
+        stage.process(frame_of(image), Mask(image > 0.5))
 
 
 def test_circles_above_change_nothing_unless_asked_for() -> None:
