@@ -19,7 +19,7 @@ import numpy as np
 from mushpipe.core.document import read_document
 from mushpipe.core.graph import compile_document
 from mushpipe.core.plugins import load_registry
-from mushpipe.core.recording import RecordingWriter
+from mushpipe.core.recorder import RecordingWriter
 from mushpipe.proof.bench import bench, machine
 from mushpipe.sources.synthetic import SyntheticSource
 

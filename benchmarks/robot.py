@@ -43,6 +43,7 @@ def random_picks(count: int, rng: np.random.Generator) -> Picks:
         center=rng.uniform(0, 480, (count, 2)),
         radius=rng.uniform(8, 38, count),
         position=rng.uniform(-0.2, 0.5, (count, 3)),
+        surface=rng.uniform(-0.2, 0.5, (count, 3)),
         distance=rng.uniform(0.4, 0.5, count),
         diameter=rng.uniform(0.02, 0.06, count),
         quaternion=quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True),

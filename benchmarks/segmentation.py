@@ -20,15 +20,15 @@ from pathlib import Path
 from typing import TypeVar
 
 import cv2
-import maxflow
 import numpy as np
+from graph_cut import graph_cut
 from numpy.typing import NDArray
 
 from mushpipe import RgbdFrame, Stage
 from mushpipe.sources.mcap import McapSource
 from mushpipe.sources.synthetic import SyntheticSource
 from mushpipe.stages.chan_vese import ChanVese
-from mushpipe.stages.chan_vese_energy import chan_vese_energy, region_means
+from mushpipe.stages.chan_vese_energy import chan_vese_energy
 from mushpipe.stages.flatten import Flatten
 from mushpipe.stages.height import Height
 from mushpipe.stages.kmeans import KMeans
@@ -60,17 +60,19 @@ def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("recordings", nargs="*", type=Path)
-    parser.add_argument("--frames", type=int, default=8, help="simulated frames")
+    parser.add_argument("--frames", type=int, default=8, help="simulated frames; 0 for none")
     parser.add_argument("--reference-frames", type=int, default=4, help="of them for scikit-image")
     args = parser.parse_args()
     cv2.setNumThreads(1)
     print(f"{versions()}\nsimulator seeds {SEED} to {SEED + args.frames - 1}, mu {MU}\n")
     frames = [bed(i) for i in range(args.frames)]
-    solvers("simulated", [frame.gray for frame in frames], args.reference_frames)
+    if frames:
+        solvers("simulated", [frame.gray for frame in frames], args.reference_frames)
     for path in args.recordings:
         images = [resized(frame.gray) for frame in McapSource(path=path).frames()]
         solvers(path.stem, images, args.reference_frames)
-    stages(frames)
+    if frames:
+        stages(frames)
 
 
 def versions() -> str:
@@ -95,7 +97,10 @@ def resized(gray: Plane) -> Plane:
 
 def solvers(title: str, images: list[Plane], few: int) -> None:
     """Print time and energy of each solver on some images."""
-    lowest = [chan_vese_energy(image, exact(image), MU) for image in images]
+    lowest = [
+        chan_vese_energy(image, graph_cut(image, otsu_foreground(image), MU), MU)
+        for image in images
+    ]
     print(f"{title}: {len(images)} frames of 640 x 480\n")
     print("| solver | frames | ms | times fast | E / minimum, mean | max | of fast there |")
     print("|---|---|---|---|---|---|---|")
@@ -138,27 +143,6 @@ def timed(call: Callable[[], T], repeats: int) -> tuple[T, float]:
         result = call()
         best = min(best, time.thread_time() - start)
     return result, best
-
-
-def exact(image: Plane) -> Region:
-    """Return the minimum for given means, alternating with them, at most four times."""
-    region = otsu_foreground(image)
-    axial, diagonal = np.zeros((3, 3)), np.zeros((3, 3))
-    axial[1, 2] = axial[2, 1] = diagonal[2, 0] = diagonal[2, 2] = 1
-    for _ in range(4):
-        (c1,), (c2,) = region_means(image, region)
-        graph = maxflow.Graph[float]()
-        nodes = graph.add_grid_nodes(image.shape)
-        weight = MU * math.pi / 8
-        graph.add_grid_edges(nodes, weight, structure=axial, symmetric=True)
-        graph.add_grid_edges(nodes, weight / math.sqrt(2), structure=diagonal, symmetric=True)
-        graph.add_grid_tedges(nodes, (image - c2) ** 2, (image - c1) ** 2)
-        graph.maxflow()
-        new = ~graph.get_grid_segments(nodes)
-        if np.array_equal(new, region):
-            break
-        region = new
-    return region
 
 
 def stages(frames: list[RgbdFrame]) -> None:

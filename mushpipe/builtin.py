@@ -23,6 +23,7 @@ def mushpipe_register(registry: Registry) -> None:
     registry.stage("nearest-depth", "mushpipe.stages.nearest_depth:NearestDepth")
     registry.stage("depth-correct", "mushpipe.stages.depth_correct:DepthCorrect")
     registry.stage("fuse-depth", "mushpipe.stages.fuse_depth:FuseDepth")
+    registry.stage("surface-fit", "mushpipe.stages.surface_fit:SurfaceFit")
     registry.stage("cap-fit", "mushpipe.stages.cap_fit:CapFit")
     registry.stage("registration", "mushpipe.stages.registration:Registration")
     registry.stage("picks", "mushpipe.stages.picks:MakePicks")

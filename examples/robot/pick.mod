@@ -1,8 +1,9 @@
 MODULE MushroomPicker
     ! RAPID client of the lines for ABB (docs/robot.md), for a graph with
-    !   robot: {use: robot-json, abb_port: 5006, mount: {...}, workspace: {...}}
+    !   pick:  {use: picks, T_base_camera: {...}}
+    !   robot: {use: robot-json, abb_port: 5006, workspace: {...}}
     ! Not run on a controller yet: check it in RobotStudio before you trust it.
-    ! The camera's mount must be in the frame of this work object.
+    ! T_base_camera must be in the frame of this work object.
     PERS wobjdata wobj_bed := [FALSE, TRUE, "", [[0,0,0],[1,0,0,0]], [[0,0,0],[1,0,0,0]]];
     PERS tooldata tool_cup := [TRUE, [[0,0,120],[1,0,0,0]], [0.5,[0,0,60],[1,0,0,0],0,0,0]];
     CONST num MAX_AGE_MS := 200;

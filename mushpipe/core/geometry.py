@@ -1,8 +1,10 @@
 """The camera model and rotations.
 
 Lens distortion is the Brown-Conrady polynomial (Brown 1966) with coefficients
-``k1 k2 p1 p2 k3``. The model ``brown_conrady`` applies it on the way into the image;
-``inverse_brown_conrady``, which Intel uses for SR300 depth, on the way out of it.
+``k1 k2 p1 p2 k3``. The model ``brown_conrady`` (ROS: plumb_bob) applies it on the way into the
+image; ``inverse_brown_conrady``, which Intel uses for SR300 depth, on the way out of it.
+``rational`` (ROS: rational_polynomial) divides the radial part by another polynomial, ``k4 k5 k6``,
+as OpenCV does.
 """
 
 from __future__ import annotations
@@ -13,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+COEFFICIENTS = {"none": 0, "brown_conrady": 5, "inverse_brown_conrady": 5, "rational": 8}
+_FORWARD = ("brown_conrady", "rational")
 
 
 def brown(xy: Array, coefficients: tuple[float, ...]) -> Array:
@@ -20,15 +24,18 @@ def brown(xy: Array, coefficients: tuple[float, ...]) -> Array:
 
     Args:
         xy: (..., 2) coordinates on the plane z = 1.
-        coefficients: ``k1 k2 p1 p2 k3``.
+        coefficients: ``k1 k2 p1 p2 k3``, then ``k4 k5 k6`` of the rational model.
 
     Returns:
         (..., 2) distorted coordinates.
     """
-    k1, k2, p1, p2, k3 = coefficients
+    k1, k2, p1, p2, k3, *below = coefficients
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    if below:
+        k4, k5, k6 = below
+        radial = radial / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
     return np.stack(
         [
             x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
@@ -75,8 +82,8 @@ class Camera:
         fy: Focal length along y.
         cx: Principal point, x; the centre of the first pixel is 0.
         cy: Principal point, y.
-        model: ``none``, ``brown_conrady`` or ``inverse_brown_conrady``.
-        coefficients: ``k1 k2 p1 p2 k3``, empty for ``none``.
+        model: ``none``, ``brown_conrady``, ``inverse_brown_conrady`` or ``rational``.
+        coefficients: ``k1 k2 p1 p2 k3``, for ``rational`` with ``k4 k5 k6``; empty for ``none``.
     """
 
     width: int
@@ -91,11 +98,11 @@ class Camera:
     def __post_init__(self) -> None:
         if not (self.width > 0 and self.height > 0 and self.fx > 0 and self.fy > 0):
             raise ValueError(f"size and focal length of a camera must be positive: {self}")
-        expected = {"none": 0, "brown_conrady": 5, "inverse_brown_conrady": 5}.get(self.model)
-        if len(self.coefficients) != expected:
+        if len(self.coefficients) != COEFFICIENTS.get(self.model):
             raise ValueError(
                 f"camera model '{self.model}' with {len(self.coefficients)} coefficients; "
-                "expected none, or (inverse_)brown_conrady with k1 k2 p1 p2 k3"
+                "expected none, (inverse_)brown_conrady with k1 k2 p1 p2 k3, or rational with "
+                "k4 k5 k6 after these"
             )
 
     def project(self, points: Array) -> Array:
@@ -103,7 +110,7 @@ class Camera:
         points = np.asarray(points, dtype=np.float64)
         z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
         xy = points[..., :2] / z[..., None]
-        if self.model == "brown_conrady":
+        if self.model in _FORWARD:
             xy = brown(xy, self.coefficients)
         elif self.model == "inverse_brown_conrady":
             xy = brown_inverse(xy, self.coefficients)
@@ -112,7 +119,7 @@ class Camera:
     def deproject(self, pixels: Array, depth: Array) -> Array:
         """Lift (..., 2) pixels at (...,) depths (z in metres) to (..., 3) points."""
         xy = (np.asarray(pixels, dtype=np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
-        if self.model == "brown_conrady":
+        if self.model in _FORWARD:
             xy = brown_inverse(xy, self.coefficients)
         elif self.model == "inverse_brown_conrady":
             xy = brown(xy, self.coefficients)

@@ -185,19 +185,29 @@ def _node(
             context={"base": document.base.absolute(), "from_shell": document.from_shell(at)},
         )
     except ValidationError as error:
-        problems += _translate(document, at, error, list(plugin_class.model_fields), use)
+        problems += _translate(document, at, error, list(_settings(plugin_class)), use)
         return None
     if ".py:" in use:
         use = str((base / use).resolve())
-    paths = {k: str(v) for k, v in settings.items() if isinstance(getattr(plugin, k), Path)}
+    attributes = _settings(plugin_class)
+    paths = {
+        key: str(value)
+        for key, value in settings.items()
+        if isinstance(getattr(plugin, attributes[key]), Path)
+    }
     return Node(str(at[-1]), kind, use, plugin, ports, dict(inputs), delivery, paths=paths)
+
+
+def _settings(plugin: type[Plugin]) -> dict[str, str]:
+    """Return the settings' names in a graph file, each with its attribute of the plugin."""
+    return {field.alias or name: name for name, field in plugin.model_fields.items()}
 
 
 def _drop_foreign(
     document: Document, at: Location, use: str, plugin: type[Plugin], settings: dict[str, Any]
 ) -> dict[str, Any]:
     """Drop the settings a swapped-in plugin does not know, unless the command line set them."""
-    foreign = settings.keys() - plugin.model_fields.keys() - document.from_shell(at)
+    foreign = settings.keys() - _settings(plugin).keys() - document.from_shell(at)
     for key in sorted(foreign):
         document.warnings.append(f"{at[-1]}: '{use}' has no setting '{key}'; it is dropped")
     return {key: value for key, value in settings.items() if key not in foreign}

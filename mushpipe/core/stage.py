@@ -25,7 +25,8 @@ STDIO = Path("-")
 """In place of a file: standard output."""
 
 
-def _resolve(path: Path, info: ValidationInfo) -> Path:
+def resolve_path(path: Path, info: ValidationInfo) -> Path:
+    """Return a path of a setting, relative to the graph file or to the shell; a validator."""
     if path == STDIO:
         return path
     context = info.context or {}
@@ -33,7 +34,7 @@ def _resolve(path: Path, info: ValidationInfo) -> Path:
     return Path(os.path.normpath(Path("" if from_shell else context.get("base", "")) / path))
 
 
-GraphPath = Annotated[Path, AfterValidator(_resolve)]
+GraphPath = Annotated[Path, AfterValidator(resolve_path)]
 """A path setting: relative to the graph file, or to the shell where the command line set it."""
 
 

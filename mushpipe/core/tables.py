@@ -6,9 +6,9 @@ standing where the value is declared missing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum, IntFlag
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +59,22 @@ class Columns:
     def check(self) -> None:
         """Raise ValueError where values contradict each other; overridden by each type."""
 
+    @classmethod
+    def unknown(cls, n: int, **known: Any) -> Self:
+        """Return n rows of which only the given fields are known: NaN, 0 or False elsewhere."""
+        blank = {}
+        for item in fields(cls):  # type: ignore[arg-type]
+            if "shape" in item.metadata:
+                dtype = np.dtype(item.metadata["dtype"])
+                empty = np.nan if dtype.kind == "f" else 0
+                blank[item.name] = np.full((n, *item.metadata["shape"]), empty, dtype)
+        return cls(**{**blank, **known})
+
+    def take(self, rows: NDArray[Any]) -> Self:
+        """Return the given rows (indices or a mask), in that order."""
+        names = [item.name for item in fields(self) if "shape" in item.metadata]  # type: ignore[arg-type]
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})  # type: ignore[type-var]
+
     def __len__(self) -> int:
         first = next(f for f in fields(self) if "shape" in f.metadata)  # type: ignore[arg-type]
         return len(getattr(self, first.name))
@@ -80,10 +96,13 @@ class DepthSource(IntEnum):
 class PickFlag(IntFlag):
     """What a robot must know about a pick before it acts on it."""
 
-    DEPTH_MISSING = 1
-    DEPTH_ESTIMATED = 2
+    DEPTH_MISSING = 1  # there is no position
+    DEPTH_ESTIMATED = 2  # the centre has no depth; that of its surroundings stands in
     POSE_UNKNOWN = 4
-    AT_BORDER = 8
+    AT_BORDER = 8  # the image cuts the cap
+    OCCLUDED = 16  # nearer mushrooms hide part of it
+    TILT_UNOBSERVABLE = 32  # there is a pose, but its tilt is little better than a guess
+    TOO_CLOSE_TO_NEIGHBOUR = 64  # less room around it than the gripper needs
 
 
 def _known(values: Floats) -> NDArray[np.bool_]:
@@ -172,13 +191,14 @@ class Poses(Columns):
 
 @dataclass(frozen=True, eq=False)
 class Picks(Columns):
-    """What the robot gets, row by row the circles that were detected.
+    """What the robot gets, in the order in which to pick.
 
     Attributes:
         id: (N,) stable while the mushroom is visible.
         center: (N, 2) px, the circle the pick came from.
         radius: (N,) px.
         position: (N, 3) m, the apex where the pose is valid, else the surface point.
+        surface: (N, 3) m, the visible surface point at the circle's centre.
         distance: (N,) m from the camera to the surface point.
         diameter: (N,) m.
         quaternion: (N, 4) x y z w.
@@ -189,13 +209,14 @@ class Picks(Columns):
         sigma_tilt: (N,) rad one sigma.
         source: (N,) `DepthSource` of the position.
         flags: (N,) `PickFlag` bits.
-        frame_id: The frame position, quaternion and axis are expressed in.
+        frame_id: The frame that positions, quaternions and axes are expressed in.
     """
 
     id: NDArray[np.int64] = column(dtype=np.int64)
     center: Floats = column(2)
     radius: Floats = column()
     position: Floats = column(3)
+    surface: Floats = column(3)
     distance: Floats = column()
     diameter: Floats = column()
     quaternion: Floats = column(4)
@@ -212,6 +233,8 @@ class Picks(Columns):
         """Ids are unique, and a pick without depth carries no position."""
         self._require(len(np.unique(self.id)) == len(self.id), "ids must be unique")
         present = self.source != DepthSource.MISSING
-        self._require(_known(self.position) == present, "position must be NaN where missing")
+        for name in ("position", "surface"):
+            known = _known(getattr(self, name))
+            self._require(known == present, f"{name} must be NaN where missing")
         flagged = (self.flags & PickFlag.DEPTH_MISSING) != 0
         self._require(flagged != present, "DEPTH_MISSING must be set exactly where missing")

@@ -25,6 +25,13 @@ DEPTH_TOPIC = "/camera/aligned_depth_to_color/image_raw"
 CAMERA_TOPIC = "/camera/color/camera_info"
 RESULT_PREFIX = "/mushpipe/"
 TIMING_TOPIC = "/mushpipe/timing"
+# name here -> name in ROS and Foxglove
+DISTORTION_MODELS = {
+    "none": "",
+    "brown_conrady": "plumb_bob",
+    "inverse_brown_conrady": "inverse_brown_conrady",
+    "rational": "rational_polynomial",
+}
 TABLES = {
     f"mushpipe.{cls.__name__}": cls
     for cls in (tables.Circles, tables.Locations, tables.Poses, tables.Picks, Truth)
@@ -136,7 +143,7 @@ def encode_camera(camera: Camera, header: Header) -> Message:
         frame_id=header.frame_id,
         width=camera.width,
         height=camera.height,
-        distortion_model={"brown_conrady": "plumb_bob", "none": ""}.get(camera.model, camera.model),
+        distortion_model=DISTORTION_MODELS[camera.model],
         D=list(camera.coefficients),
         K=k,
         R=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],

@@ -1,4 +1,4 @@
-"""The verb `mushpipe eval`; everything heavy is imported when it runs."""
+"""The verbs `eval` and `calibrate`; everything heavy is imported when they run."""
 
 from __future__ import annotations
 
@@ -63,9 +63,41 @@ OutOption = Annotated[Path | None, typer.Option(help="folder to keep the graph's
 ReportOption = Annotated[Path | None, typer.Option(help="folder for a page with plots")]
 
 
+calibrate_app = typer.Typer(help="Measure a camera's errors.", no_args_is_help=True)
+
+
 def register(app: typer.Typer) -> None:
-    """Add the verb to the program."""
+    """Add the verbs to the program."""
     app.command("eval")(evaluate)
+    app.add_typer(calibrate_app, name="calibrate")
+
+
+@calibrate_app.command("depth")
+def calibrate_depth(
+    recordings: Annotated[list[Path], typer.Argument(help="planes square to the camera")],
+    plane: Annotated[
+        str, typer.Option(metavar="METRES", help="true distances; one for all, or one each")
+    ],
+    order: Annotated[
+        int, typer.Option(min=0, max=2, help="0: an offset; 1, 2: with a slope, a curve")
+    ] = 0,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="file for depth-correct's `calibration`")
+    ] = None,
+    resamples: ResamplesOption = 1000,
+    seed: SeedOption = 0,
+) -> None:
+    """Find what `depth-correct` must take off, from planes at known distances."""
+    from mushpipe.evaluate.calibrate import fit_correction
+    from mushpipe.evaluate.plane import judge_planes
+    from mushpipe.evaluate.show import plane_table
+
+    rows, _, _ = judge_planes(recordings, plane, [], resamples, seed)
+    correction = fit_correction(rows, order)
+    _print([plane_table(rows)])
+    _write(correction.fragment())
+    if out is not None:
+        out.write_text(correction.fragment())
 
 
 def evaluate(

@@ -93,9 +93,10 @@ def measure_plane(
     for name in PLANE_METRICS:
         x = np.array([frame[name] for frame in frames])
         value = statistics.evaluate(statistics.mean, x, np.ones((1, len(x))))[0]
-        ends = statistics.interval(statistics.evaluate(statistics.mean, x, weights))
-        few = len(frames) < 2 or not resamples
-        values[name] = Value(float(value), *((np.nan, np.nan) if few else ends), len(x))
+        ends = (np.nan, np.nan)
+        if len(frames) > 1 and resamples:
+            ends = statistics.interval(statistics.evaluate(statistics.mean, x, weights))
+        values[name] = Value(float(value), *ends, len(x))
     return PlaneRow(recording.stem, distance_m, len(frames), values)
 
 

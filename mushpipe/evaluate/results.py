@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from mushpipe.core.errors import InputError, UsageError, suggest
 from mushpipe.core.recording import MANIFEST, Index, Raw, RecordingReader
-from mushpipe.core.tables import Circles, Columns, Floats, Locations, PickFlag, Picks, column
+from mushpipe.core.tables import Circles, Columns, Floats, PickFlag, Picks, column
 from mushpipe.core.types import Header
-from mushpipe.core.wire import RESULT_PREFIX, TIMING_TOPIC, decode_table
+from mushpipe.core.wire import TIMING_TOPIC, decode_table
 
-PICKS, CIRCLES, LOCATIONS = "mushpipe.Picks", "mushpipe.Circles", "mushpipe.Locations"
+PICKS, CIRCLES = "mushpipe.Picks", "mushpipe.Circles"
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,55 +51,21 @@ class Detections(Columns):
     frame_id: str = ""
 
 
-def of_picks(picks: Picks, locations: Locations | None = None) -> Detections:
-    """Return picks as detections.
-
-    Args:
-        picks: What the robot gets.
-        locations: Of the same rows, for the surface points; without them the surface point of a
-            pick whose position is the apex is unknown.
-    """
+def of_picks(picks: Picks) -> Detections:
+    """Return picks as detections."""
     apex = np.asarray((picks.flags & PickFlag.POSE_UNKNOWN) == 0) & np.isfinite(picks.axis[:, 0])
-    if locations is not None and len(locations) == len(picks):
-        surface = locations.position
-    else:
-        surface = np.where(apex[:, None], np.nan, picks.position)
-    return Detections(
-        center=picks.center,
-        radius=picks.radius,
-        position=picks.position,
-        apex=apex,
-        surface=surface,
-        diameter=picks.diameter,
-        axis=picks.axis,
-        sigma_position=picks.sigma_position,
-        sigma_diameter=picks.sigma_diameter,
-        sigma_tilt=picks.sigma_tilt,
-        frame_id=picks.frame_id,
-    )
+    same = {item.name for item in fields(Detections)} - {"apex"}
+    return Detections(apex=apex, **{name: getattr(picks, name) for name in same})
 
 
 def of_circles(circles: Circles) -> Detections:
     """Return circles as detections of which nothing in 3D is known."""
-    n = len(circles)
-    vectors, numbers = np.full((n, 3), np.nan), np.full(n, np.nan)
-    return Detections(
-        center=circles.center,
-        radius=circles.radius,
-        position=vectors,
-        apex=np.zeros(n, bool),
-        surface=vectors,
-        diameter=numbers,
-        axis=vectors,
-        sigma_position=vectors,
-        sigma_diameter=numbers,
-        sigma_tilt=numbers,
-    )
+    return Detections.unknown(len(circles), center=circles.center, radius=circles.radius)
 
 
 def none_found() -> Detections:
     """Return the answer of a graph that found nothing."""
-    return of_circles(Circles(np.empty((0, 2)), np.empty(0), np.empty(0)))
+    return Detections.unknown(0)
 
 
 @dataclass
@@ -143,25 +109,16 @@ def read_results(path: Path, topic: str | None = None) -> Results:
     reader = RecordingReader(path)
     index = reader.index()
     manifest = json.loads(index.metadata.get(MANIFEST, {}).get("json", "{}"))
-    order = list(manifest.get("graph", {}).get("stages", {}))
     topic = _choose(path, index, topic)
-    beside = _locations_of(index, topic, order)
     results = Results(path, topic, manifest=manifest)
-    wanted = {topic, TIMING_TOPIC, *([beside] if beside else [])}
-    tables: dict[tuple[int, int], dict[str, Columns]] = {}
-    headers: dict[tuple[int, int], Header] = {}
-    for raw in reader.messages(wanted):
+    found: dict[tuple[int, int], tuple[Header, Detections]] = {}
+    for raw in reader.messages({topic, TIMING_TOPIC}):
         if raw.channel.topic == TIMING_TOPIC:
             _add_durations(results, raw)
-            continue
-        header, table = _decode(path, raw)
-        key = (header.stamp_ns, header.sequence)
-        tables.setdefault(key, {})[raw.channel.topic] = table
-        if raw.channel.topic == topic:
-            headers[key] = header
-    for key, header in headers.items():
-        found = _detections(tables[key][topic], tables[key].get(beside or ""))
-        results.frames.append((header, found))
+        else:
+            header, table = _decode(path, raw)
+            found[header.stamp_ns, header.sequence] = header, _detections(table)
+    results.frames = list(found.values())
     results.damage = list(reader.damage)
     return results
 
@@ -184,20 +141,6 @@ def _choose(path: Path, index: Index, topic: str | None) -> str:
     return topic or candidates[0]
 
 
-def _locations_of(index: Index, picks: str, order: list[str]) -> str | None:
-    """Return the topic of the locations that the picks were made of: the nearest stage above."""
-    topics = [t for t in index.channels if index.schema_name(t) == LOCATIONS]
-    if len(topics) < 2 or _stage(picks) not in order:
-        return topics[0] if len(topics) == 1 else None
-    above = order[: order.index(_stage(picks))]
-    ranked = [t for t in topics if _stage(t) in above]
-    return max(ranked, key=lambda t: above.index(_stage(t)), default=None)
-
-
-def _stage(topic: str) -> str:
-    return topic.removeprefix(RESULT_PREFIX).partition("/")[0]
-
-
 def _decode(path: Path, raw: Raw) -> tuple[Header, Columns]:
     try:
         decoded = decode_table(
@@ -210,9 +153,9 @@ def _decode(path: Path, raw: Raw) -> tuple[Header, Columns]:
     return decoded.header, decoded.table
 
 
-def _detections(table: Columns, beside: Columns | None) -> Detections:
+def _detections(table: Columns) -> Detections:
     if isinstance(table, Picks):
-        return of_picks(table, beside if isinstance(beside, Locations) else None)
+        return of_picks(table)
     return of_circles(table) if isinstance(table, Circles) else none_found()
 
 

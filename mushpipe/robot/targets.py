@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 import orjson
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from mushpipe.core.tables import DepthSource, PickFlag, Picks
 
@@ -49,41 +49,6 @@ class Workspace(BaseModel):
         return np.asarray(inside.all(axis=1))
 
 
-class Mount(BaseModel):
-    """Where the camera is: its pose in the frame the robot works in."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    frame: str = Field(min_length=1, max_length=64, description="name of the robot's frame")
-    position: Vector = Field(description="the camera's origin in that frame, m")
-    quaternion: tuple[float, float, float, float] = Field(
-        description="rotation from the camera's frame to that frame, x y z w"
-    )
-
-    @field_validator("quaternion")
-    @classmethod
-    def _unit(cls, value: tuple[float, ...]) -> tuple[float, ...]:
-        if abs(sum(q * q for q in value) - 1) > UNIT_TOLERANCE:
-            raise ValueError("the quaternion must have length 1")
-        return value
-
-    def apply(self, table: _Table) -> None:
-        """Re-express a table in the robot's frame, in place."""
-        from scipy.spatial.transform import Rotation
-
-        rotation = Rotation.from_quat(self.quaternion)
-        matrix = rotation.as_matrix()
-        table.position = table.position @ matrix.T + self.position
-        table.axis = table.axis @ matrix.T
-        table.sigma_position = np.sqrt(table.sigma_position**2 @ (matrix**2).T)
-        known = table.oriented
-        if known.any():
-            table.quaternion[known] = (
-                rotation * Rotation.from_quat(table.quaternion[known])
-            ).as_quat()
-        table.frame = self.frame
-
-
 @dataclass(frozen=True)
 class Target:
     """One target, ready to leave.
@@ -103,7 +68,7 @@ class Target:
 
 @dataclass(frozen=True)
 class Choice:
-    """The targets of one frame, best first, and how many picks were withheld, by reason."""
+    """The targets of one frame, in the picks' order, and how many were withheld, by reason."""
 
     frame: str
     targets: tuple[Target, ...]
@@ -111,17 +76,17 @@ class Choice:
 
 
 class _Table:
-    """The picks as arrays that may be changed."""
+    """The picks, and which of them have an orientation."""
 
     def __init__(self, picks: Picks) -> None:
         self.frame = picks.frame_id
         self.id = picks.id
-        self.position = picks.position.copy()
-        self.axis = picks.axis.copy()
-        self.quaternion = picks.quaternion.copy()
+        self.position = picks.position
+        self.axis = picks.axis
+        self.quaternion = picks.quaternion
         self.diameter = picks.diameter
         self.score = picks.score
-        self.sigma_position = picks.sigma_position.copy()
+        self.sigma_position = picks.sigma_position
         self.sigma_diameter = picks.sigma_diameter
         self.sigma_tilt = picks.sigma_tilt
         self.source = picks.source
@@ -137,24 +102,19 @@ class Filter:
         self,
         allow_estimated: bool = False,
         workspace: Workspace | None = None,
-        mount: Mount | None = None,
         limit: int = 200,
     ) -> None:
         self._allow_estimated = allow_estimated
         self._workspace = workspace
-        self._mount = mount
         self._limit = limit
 
     def __call__(self, picks: Picks) -> Choice:
         """Return what may be sent of one frame's picks."""
         table = _Table(picks)
         with np.errstate(all="ignore"):
-            if self._mount is not None:
-                self._mount.apply(table)
             left, withheld = self._sieve(table)
-            order = left[np.lexsort((table.id[left], -table.score[left]))]
-            withheld["limit"] = max(0, len(order) - self._limit)
-            return Choice(table.frame, _targets(table, order[: self._limit]), withheld)
+            withheld["limit"] = max(0, len(left) - self._limit)
+            return Choice(table.frame, _targets(table, left[: self._limit]), withheld)
 
     def _sieve(self, table: _Table) -> tuple[NDArray[np.intp], dict[Reason, int]]:
         bad: dict[Reason, Bools] = {

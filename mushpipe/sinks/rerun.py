@@ -11,6 +11,7 @@ from pydantic import Field, PrivateAttr
 from mushpipe import Circles, DepthSource, GraphPath, Mask, Picks, RgbdFrame, RunInfo, Sink
 
 _IMAGE = "camera/image"
+_DETECTED = (0, 200, 255)
 
 
 class RerunSink(Sink):
@@ -66,19 +67,20 @@ class RerunSink(Sink):
             if mask.initial is not None:
                 initial = rr.SegmentationImage(mask.initial.astype(np.uint8))
                 rec.log(f"{_IMAGE}/initial", initial)
-        if circles is not None:
-            same = picks if picks is not None and len(picks) == len(circles) else None
+        outlines = circles if picks is None else picks
+        if outlines is not None:
             ellipses = rr.Ellipses2D(
-                centers=circles.center,
-                half_sizes=np.repeat(circles.radius[:, None], 2, axis=1),
-                colors=_colors(same, circles),
-                labels=None if same is None else _labels(same),
+                centers=outlines.center,
+                half_sizes=np.repeat(outlines.radius[:, None], 2, axis=1),
+                colors=[_DETECTED] if picks is None else _colors(picks),
+                labels=None if picks is None else _labels(picks),
             )
             rec.log(f"{_IMAGE}/circles", ellipses)
         if picks is not None:
             known = picks.source != DepthSource.MISSING
             radii = np.nan_to_num(picks.diameter[known]) / 2
-            rec.log("camera/picks", rr.Points3D(picks.position[known], radii=radii))
+            place = "camera" if picks.frame_id == frame.header.frame_id else picks.frame_id
+            rec.log(f"{place}/picks", rr.Points3D(picks.position[known], radii=radii))
 
     def _log_frame(self, frame: RgbdFrame) -> None:
         import rerun as rr
@@ -114,10 +116,8 @@ def _labels(picks: Picks) -> list[str]:
     return [f"{i}{size}" for i, size in zip(picks.id, sizes, strict=True)]
 
 
-def _colors(picks: Picks | None, circles: Circles) -> list[tuple[int, int, int]]:
+def _colors(picks: Picks) -> list[tuple[int, int, int]]:
     """Green is measured, amber estimated from neighbours, red without depth."""
-    if picks is None or len(picks) != len(circles):
-        return [(0, 200, 255)] * len(circles)
     palette = {0: (255, 70, 70), 1: (60, 220, 90), 2: (255, 190, 40)}
     return [palette[int(source)] for source in picks.source]
 

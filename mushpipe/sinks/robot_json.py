@@ -21,7 +21,7 @@ from mushpipe.robot.connection import Limits
 from mushpipe.robot.hub import Ending, Hub, Settings
 from mushpipe.robot.server import Listener, Opener, Options, RobotServer
 from mushpipe.robot.session import JsonSession
-from mushpipe.robot.targets import Filter, Mount, Workspace
+from mushpipe.robot.targets import Filter, Workspace
 from mushpipe.robot.transcript import Transcript
 
 logger = logging.getLogger("mushpipe")
@@ -56,12 +56,9 @@ class RobotJsonSink(Sink):
     )
     allow_estimated: bool = Field(False, description="send targets whose depth is a guess")
     workspace: Workspace | None = Field(
-        None, description="box in the targets' frame; nothing outside is sent"
+        None, description="box in the picks' frame; nothing outside is sent"
     )
-    mount: Mount | None = Field(
-        None, description="pose of the camera in the robot's frame; targets are sent in that frame"
-    )
-    max_targets: int = Field(200, ge=1, le=1000, description="the best so many are sent")
+    max_targets: int = Field(200, ge=1, le=1000, description="the first so many are sent")
     claim_s: float = Field(
         60, gt=0, le=3600, description="an accepted target comes back after so long without a word"
     )
@@ -113,7 +110,7 @@ class RobotJsonSink(Sink):
             )
         self._live = run.live
         self._placer = Placer(self._clock)
-        self._filter = Filter(self.allow_estimated, self.workspace, self.mount, self.max_targets)
+        self._filter = Filter(self.allow_estimated, self.workspace, self.max_targets)
         hub = Hub(self._settings(run.live, token), self._clock, run.frames_read)
         options = Options(
             self._listeners(), Limits(lines_per_s=self.lines_per_s), self.max_clients, tls

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.geometry import Camera
+from mushpipe.core.geometry import COEFFICIENTS, Camera
+from mushpipe.core.wire import DISTORTION_MODELS
 
 # encoding -> (bytes per pixel, order of its channels that gives RGB)
 _COLOR: dict[str, tuple[int, tuple[int, ...]]] = {
@@ -149,11 +150,12 @@ def decode_camera(message: Any) -> Camera | None:
     model: str = "none"
     coefficients: tuple[float, ...] = ()
     if any(d):
-        names = {"plumb_bob": "brown_conrady", "inverse_brown_conrady": "inverse_brown_conrady"}
-        if message.distortion_model not in names or len(d) != 5:
+        names = {wire: own for own, wire in DISTORTION_MODELS.items()}
+        model, coefficients = names.get(message.distortion_model, "unknown"), tuple(d)
+        if COEFFICIENTS.get(model) != len(d):
             raise ValueError(
                 f"distortion model '{message.distortion_model}' with {len(d)} coefficients is not "
-                "supported (supported: plumb_bob with 5); rectify the images"
+                "supported (supported: plumb_bob with 5, rational_polynomial with 8); "
+                "rectify the images"
             )
-        model, coefficients = names[message.distortion_model], tuple(d)
     return Camera(message.width, message.height, k[0], k[4], k[2], k[5], model, coefficients)

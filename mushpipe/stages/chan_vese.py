@@ -57,8 +57,7 @@ class ChanVese(Stage):
         if self.polarity == "dark":
             image = 1 - image
         found = initial_contour(image, self.check)
-        auto = self.polarity == "auto" and frame.depth is not None
-        if auto and rise(frame, found.region) < -SUNKEN_M:
+        if self.polarity == "auto" and rise(frame, found.region) < -SUNKEN_M:
             image = 1 - image
             found = initial_contour(image, self.check)
         initial = found.region

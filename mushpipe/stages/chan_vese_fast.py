@@ -5,22 +5,24 @@ sqrt(2 pi) / sigma * sum u (1 - G_sigma * u); linearised, an iteration is a blur
 
     u <- 1 where (c1 - c2)(2 I - c1 - c2) - mu sqrt(2 pi) / sigma (1 - 2 G_sigma * u) > 0
 
-The sweeps that follow, on every level, descend the exact discrete energy on the pixels of the
-contour (ICM, Besag 1986), which convolution with its finite kernel cannot reach.
+The sweeps that follow, on every level, descend the exact discrete energy pixel by pixel (ICM, Besag
+1986), which convolution with its finite kernel cannot reach.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.jit import jit
+from mushpipe.core.jit import inlined, jit
 
 Plane = NDArray[np.float32]
 Planes = NDArray[np.float32]
+Bits = NDArray[np.uint8]  # 1 inside, 0 outside; a quarter of the memory that floats would need
 Levels = tuple[float, float]
 SIGMA = 1.5
 _TAPS = np.exp(-(np.arange(-3, 4) ** 2) / (2 * SIGMA**2)).astype(np.float32)
@@ -29,7 +31,7 @@ _TAPS /= _TAPS.sum()
 
 @jit
 def ictm_sweep(
-    image: Plane, old: Plane, new: Plane, taps: Plane, gain: float, offset: float, pull: float
+    image: Plane, old: Bits, new: Bits, taps: Plane, gain: float, offset: float, pull: float
 ) -> int:
     """One iteration: new = 1 where gain I + offset + pull (2 G*old - 1) > 0, borders replicated.
 
@@ -45,10 +47,10 @@ def ictm_sweep(
         d, e, f = min(y + 1, height - 1), min(y + 2, height - 1), min(y + 3, height - 1)
         for x in range(width):
             row[x + 3] = (
-                g0 * old[y, x]
-                + g1 * (old[c, x] + old[d, x])
-                + g2 * (old[b, x] + old[e, x])
-                + g3 * (old[a, x] + old[f, x])
+                g0 * np.float32(old[y, x])
+                + g1 * (np.float32(old[c, x]) + np.float32(old[d, x]))
+                + g2 * (np.float32(old[b, x]) + np.float32(old[e, x]))
+                + g3 * (np.float32(old[a, x]) + np.float32(old[f, x]))
             )
         row[0] = row[1] = row[2] = row[3]
         row[width + 3] = row[width + 4] = row[width + 5] = row[width + 2]
@@ -62,14 +64,14 @@ def ictm_sweep(
             )
             phi = slope * image[y, x] + level + bend * blur
             label = np.float32(1) if phi > 0 else np.float32(0)
-            moved += abs(label - old[y, x])
-            new[y, x] = label
+            moved += abs(label - np.float32(old[y, x]))
+            new[y, x] = np.uint8(label)
         changed += int(moved)
     return changed
 
 
 @jit
-def region_sums(image: Plane, u: Plane) -> tuple[int, float, float]:
+def region_sums(image: Plane, u: Bits) -> tuple[int, float, float]:
     """Return the number of pixels inside, the image's sum over them, and its sum over all."""
     height, width = image.shape
     inside = 0
@@ -79,8 +81,9 @@ def region_sums(image: Plane, u: Plane) -> tuple[int, float, float]:
         # Sums of one row in float32 keep the loop vectorised; a row is too short to lose digits.
         count = sum_row = all_row = np.float32(0)
         for x in range(width):
-            count += u[y, x]
-            sum_row += u[y, x] * image[y, x]
+            member = np.float32(u[y, x])
+            count += member
+            sum_row += member * image[y, x]
             all_row += image[y, x]
         inside += int(count)
         total += float(sum_row)
@@ -89,56 +92,66 @@ def region_sums(image: Plane, u: Plane) -> tuple[int, float, float]:
 
 
 @jit
-def icm_sweep(image: Plane, u: Plane, gain: float, offset: float, mu: float) -> int:
-    """Flip, in raster order and in place, each pixel of the contour that lowers the energy by it.
+def icm_sweep(image: Plane, u: Bits, gain: float, offset: float, mu: float) -> int:
+    """Flip, in raster order and in place, each pixel that lowers the energy by it.
 
-    Label 1 where -(gain I + offset) + a (4 - 2 n4) + b (4 - 2 nd) < 0, with a = mu pi/8 and
-    b = a / sqrt 2, n4 and nd the set axial and diagonal neighbours; none lie beyond the border.
+    With s = 1 outside, -1 inside and 0 beyond the border, a flip lowers the energy by
+    s (gain I + offset - a sum s4 - b sum sd), a = mu pi/8 and b = a / sqrt 2, s4 and sd the axial
+    and diagonal neighbours. Few pixels flip: which may is asked of a row at once, and of those each
+    again in its turn.
 
     Returns the number of flips.
     """
     height, width = image.shape
-    a = np.float32(mu * math.pi / 8)
-    b = np.float32(mu * math.pi / 8 / math.sqrt(2))
-    slope, level, one, two = np.float32(gain), np.float32(offset), np.float32(1), np.float32(2)
-    column = np.empty(width + 2, np.float32)
+    a, b = np.float32(mu * math.pi / 8), np.float32(mu * math.pi / 8 / math.sqrt(2))
+    slope, level = np.float32(gain), np.float32(offset)
+    above, here, below = np.zeros((3, width + 2), np.float32)
+    force = np.empty(width, np.float32)
+    may = np.zeros((width + 7) // 8 * 8, np.uint8)
+    eight = may.view(np.uint64)
     flips = 0
+    _signs(u, 0, below)
     for y in range(height):
-        up, down = max(y - 1, 0), min(y + 1, height - 1)
+        above, here, below = here, below, above
+        _signs(u, y + 1, below)
         for x in range(width):
-            column[x + 1] = u[up, x] + u[y, x] + u[down, x]
-        column[0], column[width + 1] = column[1], column[width]
-        above, below = np.float32(y > 0), np.float32(y < height - 1)
-        for x in range(width):
-            around = column[x] + column[x + 1] + column[x + 2]
-            if around < np.float32(0.5) or around > np.float32(8.5):
+            force[x] = slope * image[y, x] + level
+            may[x] = here[x + 1] * (force[x] - _pull(above, here, below, x, a, b)) > 0
+        for k in range(len(eight)):
+            if eight[k] == 0:
                 continue
-            left, right = max(x - 1, 0), min(x + 1, width - 1)
-            west, east = np.float32(x > 0), np.float32(x < width - 1)
-            axial = above * (one - two * u[up, x]) + below * (one - two * u[down, x])
-            axial += west * (one - two * u[y, left]) + east * (one - two * u[y, right])
-            diagonal = above * (
-                west * (one - two * u[up, left]) + east * (one - two * u[up, right])
-            )
-            diagonal += below * (
-                west * (one - two * u[down, left]) + east * (one - two * u[down, right])
-            )
-            inside = a * axial + b * diagonal < slope * image[y, x] + level
-            if inside != (u[y, x] > 0):
-                flips += 1
-                u[y, x] = np.float32(inside)
+            for x in range(8 * k, min(8 * k + 8, width)):
+                falls = here[x + 1] * (force[x] - _pull(above, here, below, x, a, b))
+                if falls > 0:
+                    here[x + 1] = -here[x + 1]
+                    u[y, x] ^= np.uint8(1)
+                    flips += 1
     return flips
+
+
+@jit
+def _signs(u: Bits, y: int, row: Plane) -> None:
+    """Write the signs of a row, 1 px to the right."""
+    height, width = u.shape
+    for x in range(width):
+        row[x + 1] = np.float32(1) - np.float32(2) * np.float32(u[y, x]) if y < height else 0
+
+
+@inlined
+def _pull(above: Plane, here: Plane, below: Plane, x: int, a: np.float32, b: np.float32) -> Any:
+    axial = above[x + 1] + below[x + 1] + here[x] + here[x + 2]
+    return a * axial + b * (above[x] + above[x + 2] + below[x] + below[x + 2])
 
 
 class _Regions:
     """The two means of a region, and the force they exert on each pixel."""
 
-    def __init__(self, planes: Planes, u: Plane, levels: Levels | None) -> None:
+    def __init__(self, planes: Planes, u: Bits, levels: Levels | None) -> None:
         self.planes = planes
         self.levels = levels
         self.update(u)
 
-    def update(self, u: Plane) -> None:
+    def update(self, u: Bits) -> None:
         sums = [region_sums(plane, u) for plane in self.planes]
         self.inside = sums[0][0]
         outside = max(1, u.size - self.inside)
@@ -151,7 +164,7 @@ class _Regions:
     def force(self) -> tuple[Plane, float, float]:
         """Return P, gain and offset of |I - c2|^2 - |I - c1|^2 = gain P + offset."""
         gain = 2 * (self.c1 - self.c2) / len(self.planes)
-        offset = float((self.c2**2 - self.c1**2).mean())
+        offset = float(self.c2 @ self.c2 - self.c1 @ self.c1) / len(self.planes)
         if len(self.planes) == 1:
             return self.planes[0], float(gain[0]), offset
         return np.tensordot(gain.astype(np.float32), self.planes, 1), 1.0, offset
@@ -176,36 +189,41 @@ def solve_fast(
         depth: Levels of the pyramid, the full resolution among them.
         iterations: Most ICTM iterations at full resolution, doubled per level; fewer where nothing
             moves any more.
-        sweeps: Most sweeps of descent on the contour at full resolution, four times more per level.
+        sweeps: Most sweeps of descent at full resolution, four times more per level.
     """
-    planes = np.ascontiguousarray(np.moveaxis(image, -1, 0) if image.ndim == 3 else image[None])
-    u = _pyramid(planes, initial.astype(np.float32), mu, levels, depth, iterations, sweeps)
-    return u > 0
+    planes = np.stack(cv2.split(image)) if image.ndim == 3 else image[None]
+    bits = initial.view(np.uint8)
+    return _pyramid(planes, bits, mu, levels, depth, iterations, sweeps).view(np.bool_)
 
 
 def _pyramid(
     planes: Planes,
-    u: Plane,
+    initial: Bits,
     mu: float,
     levels: Levels | None,
     depth: int,
     iterations: int,
     sweeps: int,
-) -> Plane:
+) -> Bits:
     """Solve at half resolution first, with mu / 2: the length halves while the area quarters."""
-    height, width = u.shape
+    height, width = initial.shape
     if depth > 1 and min(height, width) >= 32:
         half = (width // 2, height // 2)
         small = np.stack([cv2.resize(p, half, interpolation=cv2.INTER_AREA) for p in planes])
-        start = cv2.resize(u, half, interpolation=cv2.INTER_AREA).round()
+        share = cv2.resize(2 * initial, half, interpolation=cv2.INTER_AREA)
+        start = np.asarray(share > 1).view(np.uint8)
         solved = _pyramid(small, start, mu / 2, levels, depth - 1, 2 * iterations, 4 * sweeps)
-        u = cv2.resize(solved, (width, height)).round()
-    u = _ictm(planes, u, mu, levels, iterations)
-    return _descend(planes, u, mu, levels, sweeps)
+        u = np.asarray(cv2.resize(solved, (width, height)), np.uint8)
+    else:
+        u = initial.copy()
+    regions = _Regions(planes, u, levels)
+    u = _ictm(regions, u, mu, iterations)
+    _descend(regions, u, mu, sweeps)
+    return u
 
 
-def _ictm(planes: Planes, u: Plane, mu: float, levels: Levels | None, iterations: int) -> Plane:
-    regions, other = _Regions(planes, u, levels), np.empty_like(u)
+def _ictm(regions: _Regions, u: Bits, mu: float, iterations: int) -> Bits:
+    other = np.empty_like(u)
     pull = mu * math.sqrt(2 * math.pi) / SIGMA
     for _ in range(iterations):
         if regions.one_sided:
@@ -219,8 +237,7 @@ def _ictm(planes: Planes, u: Plane, mu: float, levels: Levels | None, iterations
     return u
 
 
-def _descend(planes: Planes, u: Plane, mu: float, levels: Levels | None, sweeps: int) -> Plane:
-    regions = _Regions(planes, u, levels)
+def _descend(regions: _Regions, u: Bits, mu: float, sweeps: int) -> None:
     for _ in range(sweeps):
         if regions.one_sided:
             break
@@ -228,4 +245,3 @@ def _descend(planes: Planes, u: Plane, mu: float, levels: Levels | None, sweeps:
         if not icm_sweep(plane, u, gain, offset, mu):
             break
         regions.update(u)
-    return u

@@ -118,38 +118,40 @@ def change_of_region(image: Plane, old: Words, new: Words) -> tuple[int, float]:
 def solve_morphological(
     image: Plane, initial: NDArray[np.bool_], iterations: int, smoothing: int
 ) -> NDArray[np.bool_]:
-    """Evolve a region until it stands still or the iterations are used up.
+    """Evolve a region through so many iterations.
+
+    The operators alternate, so a region at rest swings between a few states: from the first that
+    comes back on, the rest is known.
 
     Args:
         image: (H, W) in 0..1.
         initial: (H, W) region to start from.
-        iterations: Most iterations.
+        iterations: Number of iterations.
         smoothing: Curvature steps per iteration, the method's counterpart of mu.
     """
     width = image.shape[1]
-    words = pack(initial)
     tail = np.uint64(2 ** ((width - 1) % 64 + 1) - 1)
-    before, flip = np.zeros_like(words[:0]), False
-    count, total, everything = region_sums(image, initial.astype(np.float32))
+    states, flip = [pack(initial)], False
+    seen = {(states[0].tobytes(), flip): 0}
+    nearer = np.empty(image.shape, bool)
+    count, total, everything = region_sums(image, initial.view(np.uint8))
     for done in range(1, iterations + 1):
         if count in (0, image.size):
             break
         c1, c2 = total / count, (everything - total) / (image.size - count)
-        middle = np.float32((c1 + c2) / 2)
-        evolved = np.empty_like(words)
-        nearer = image > middle if c1 > c2 else image < middle
-        attachment_step(words, pack(nearer), evolved, width)
+        (np.greater if c1 > c2 else np.less)(image, np.float32((c1 + c2) / 2), out=nearer)
+        evolved = np.empty_like(states[-1])
+        attachment_step(states[-1], pack(nearer), evolved, width)
         for _ in range(smoothing):
             evolved = _smooth(evolved, tail, flip)
             flip = not flip
-        grown, added = change_of_region(image, words, evolved)
+        grown, added = change_of_region(image, states[-1], evolved)
         count, total = count + grown, total + added
-        # The operators alternate, so a region at rest may swing between two states.
-        at_rest = np.array_equal(evolved, before)
-        before, words = words, evolved
-        if at_rest:
-            return unpack(words if (iterations - done) % 2 == 0 else before, width)
-    return unpack(words, width)
+        first = seen.setdefault((evolved.tobytes(), flip), done)
+        if first < done:
+            return unpack(states[first + (iterations - first) % (done - first)], width)
+        states.append(evolved)
+    return unpack(states[-1], width)
 
 
 def _smooth(words: Words, tail: np.uint64, flip: bool) -> Words:

@@ -26,7 +26,9 @@ def otsu_foreground(gray: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 def initial_contour(image: NDArray[np.float32], check: bool) -> Evidence:
     """Return Otsu's foreground of an (H, W[, C]) image, or with ``check`` the believed one."""
-    plane = image if image.ndim == 2 else np.ascontiguousarray(image.mean(axis=2))
+    plane = image
+    if image.ndim == 3:
+        plane = np.asarray(cv2.transform(image, np.full((1, image.shape[2]), 1 / image.shape[2])))
     return believed_foreground(plane) if check else Evidence(otsu_foreground(plane), 0.0, 0.0)
 
 

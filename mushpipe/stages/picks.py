@@ -3,29 +3,81 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, PrivateAttr
+from pydantic import Field, PrivateAttr, field_validator
 
 from mushpipe import Circles, DepthSource, Locations, PickFlag, Picks, Poses, RgbdFrame, Stage
+from mushpipe.core.transform import Transform, TransformSetting
+from mushpipe.stages.surroundings import clearance, hidden_share
 from mushpipe.stages.tracks import Tracks
 
 logger = logging.getLogger("mushpipe")
+Rank = Literal["unoccluded", "highest", "largest", "score"]
+FlagName = Literal[
+    "depth_missing",
+    "depth_estimated",
+    "pose_unknown",
+    "at_border",
+    "occluded",
+    "tilt_unobservable",
+    "too_close_to_neighbour",
+]
 
 
 class MakePicks(Stage):
-    """Joins what is known of each mushroom into a pick, and gives it an id that stays with it.
+    """Joins what is known of each mushroom into a pick, and puts the picks in order.
 
     The position is the cap's apex where the pose is valid, else the surface point at the circle's
-    centre. Nothing is filled in: what is unknown stays NaN and is flagged.
+    centre. Nothing is filled in: what is unknown stays NaN and is flagged. An id stays with its
+    mushroom while it is visible, also under a camera that moves sideways.
     """
 
+    T_base_camera: TransformSetting | None = Field(
+        None,
+        description="pose of the camera in the robot's frame, {frame, translation (m), quaternion "
+        "(x y z w)} or a YAML file with these; picks are given in that frame",
+    )
+    order: tuple[Rank, ...] = Field(
+        ("unoccluded", "highest"),
+        description="what comes first; the next one decides between equals. Height is z of the "
+        "robot's frame, or nearness along the optical axis without one",
+    )
+    min_score: float = Field(0, ge=0, le=1, description="circles with a lower score are left out")
+    diameter_mm: tuple[float, float] | None = Field(
+        None, description="only caps of such a diameter, mm; an unknown one is left out"
+    )
+    withhold: tuple[FlagName, ...] = Field(
+        (), description="mushrooms with any of these flags are left out instead of flagged"
+    )
+    occluded_share: float = Field(
+        0.1, ge=0, le=1, description="share of the outline behind nearer mushrooms to be flagged"
+    )
+    clearance_mm: float = Field(
+        0, ge=0, le=500, description="room the gripper needs around a cap, to other caps, mm"
+    )
+    tilt_sigma_deg: float = Field(
+        10, gt=0, description="from this sigma on the tilt counts as unobservable, degrees"
+    )
     memory_s: float = Field(1.0, ge=0, description="how long an id survives its mushroom unseen")
+
+    @field_validator("diameter_mm")
+    @classmethod
+    def _range(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
+        if value is not None and not 0 <= value[0] < value[1]:
+            raise ValueError("expected the smallest and the largest diameter, mm")
+        return value
 
     _tracks: Tracks = PrivateAttr(default_factory=Tracks)
     _total: int = PrivateAttr(0)
     _missing: int = PrivateAttr(0)
+
+    def open(self) -> None:
+        """Compile the kernels."""
+        hidden_share(Circles(np.full((1, 2), 4.0), np.ones(1), np.ones(1)), np.ones(1), (8, 8))
 
     def process(
         self,
@@ -34,65 +86,124 @@ class MakePicks(Stage):
         locations: Locations,
         poses: Poses | None = None,
     ) -> Picks:
-        """Return one pick per circle, in the camera's frame.
+        """Return the picks, the first to pick first, in the robot's frame or the camera's.
 
         Raises:
             ValueError: The inputs differ in their number of rows.
         """
         n = len(circles)
-        poses = poses or _unknown_poses(n)
+        poses = poses or Poses.unknown(n)
         if not n == len(locations) == len(poses):
             raise ValueError(f"{n} circles, {len(locations)} locations, {len(poses)} poses")
-        located = locations.source != DepthSource.MISSING
         self._total += n
-        self._missing += int((~located).sum())
-        return Picks(
-            id=self._tracks.update(circles, frame.header.stamp_ns, round(self.memory_s * 1e9)),
-            center=circles.center,
-            radius=circles.radius,
-            position=np.where((located & poses.valid)[:, None], poses.apex, locations.position),
-            distance=locations.distance,
-            diameter=locations.diameter,
-            quaternion=poses.quaternion,
-            axis=poses.axis,
-            score=circles.score,
-            sigma_position=locations.sigma_position,
-            sigma_diameter=locations.sigma_diameter,
-            sigma_tilt=poses.sigma_rad,
-            source=locations.source,
-            flags=_flags(frame, circles, locations, poses),
-            frame_id=frame.header.frame_id,
+        self._missing += int((locations.source == DepthSource.MISSING).sum())
+        height, width = frame.color.shape[:2]
+        ids = self._tracks.update(
+            circles,
+            locations,
+            (width, height),
+            frame.header.stamp_ns,
+            round(self.memory_s * 1e9),
         )
+        hidden = hidden_share(circles, locations.distance, (width, height))
+        flags = self._flags((width, height), circles, locations, poses, hidden)
+        picks = _joined(ids, circles, locations, poses, flags, frame.header.frame_id)
+        up = -locations.position[:, 2]
+        if self.T_base_camera is not None:
+            picks = in_base(picks, self.T_base_camera)
+            up = picks.surface[:, 2]
+        return picks.take(self._chosen(picks, up, hidden))
+
+    def _flags(
+        self,
+        image: tuple[int, int],
+        circles: Circles,
+        locations: Locations,
+        poses: Poses,
+        hidden: NDArray[np.float64],
+    ) -> NDArray[np.uint32]:
+        reach = circles.radius[:, None]
+        cut = (circles.center < reach) | (circles.center + reach > np.array(image) - 1)
+        flags = np.zeros(len(circles), np.uint32)
+        for flag, where in (
+            (PickFlag.DEPTH_MISSING, locations.source == DepthSource.MISSING),
+            (PickFlag.DEPTH_ESTIMATED, locations.source == DepthSource.NEIGHBOURS),
+            (PickFlag.POSE_UNKNOWN, ~poses.valid),
+            (PickFlag.AT_BORDER, cut.any(axis=1)),
+            (PickFlag.OCCLUDED, hidden > self.occluded_share),
+            (PickFlag.TILT_UNOBSERVABLE, poses.sigma_rad >= np.radians(self.tilt_sigma_deg)),
+            (PickFlag.TOO_CLOSE_TO_NEIGHBOUR, 1000 * clearance(locations) < self.clearance_mm),
+        ):
+            flags[where] |= np.uint32(flag)
+        return flags
+
+    def _chosen(
+        self, picks: Picks, up: NDArray[np.float64], hidden: NDArray[np.float64]
+    ) -> NDArray[np.intp]:
+        """Return the rows that are given, the first to pick first; without depth comes last."""
+        unwanted = sum(PickFlag[name.upper()] for name in self.withhold)
+        keep = (picks.score >= self.min_score) & ((picks.flags & np.uint32(unwanted)) == 0)
+        if self.diameter_mm is not None:
+            low, high = self.diameter_mm
+            keep &= (1000 * picks.diameter >= low) & (1000 * picks.diameter <= high)
+        keys = {
+            "unoccluded": hidden > self.occluded_share,
+            "highest": -up,
+            "largest": -picks.diameter,
+            "score": -picks.score,
+        }
+        missing = picks.source == DepthSource.MISSING
+        # the last key is the first to decide; NaN goes to the end
+        order = np.lexsort([picks.id, *(keys[name] for name in self.order[::-1]), missing])
+        return np.asarray(order[keep[order]])
 
     def close(self) -> None:
-        """Say how many picks a robot could not have reached."""
+        """Say how many mushrooms a robot could not have reached."""
         if self._missing:
             logger.warning(
-                "%d of %d picks have no position: there is no depth at them",
+                "%d of %d mushrooms have no position: there is no depth at them",
                 self._missing,
                 self._total,
             )
 
 
-def _flags(
-    frame: RgbdFrame, circles: Circles, locations: Locations, poses: Poses
-) -> NDArray[np.uint32]:
-    height, width = frame.color.shape[:2]
-    x, y = circles.center.T
-    left, right = x - circles.radius, x + circles.radius
-    top, bottom = y - circles.radius, y + circles.radius
-    border = (left < 0) | (top < 0) | (right > width - 1) | (bottom > height - 1)
-    flags = np.zeros(len(circles), np.uint32)
-    for flag, where in (
-        (PickFlag.DEPTH_MISSING, locations.source == DepthSource.MISSING),
-        (PickFlag.DEPTH_ESTIMATED, locations.source == DepthSource.NEIGHBOURS),
-        (PickFlag.POSE_UNKNOWN, ~poses.valid),
-        (PickFlag.AT_BORDER, border),
-    ):
-        flags[where] |= np.uint32(flag)
-    return flags
+def _joined(
+    ids: NDArray[np.int64],
+    circles: Circles,
+    locations: Locations,
+    poses: Poses,
+    flags: NDArray[np.uint32],
+    frame_id: str,
+) -> Picks:
+    located = locations.source != DepthSource.MISSING
+    return Picks(
+        id=ids,
+        center=circles.center,
+        radius=circles.radius,
+        position=np.where((located & poses.valid)[:, None], poses.apex, locations.position),
+        surface=locations.position,
+        distance=locations.distance,
+        diameter=locations.diameter,
+        quaternion=poses.quaternion,
+        axis=poses.axis,
+        score=circles.score,
+        sigma_position=locations.sigma_position,
+        sigma_diameter=locations.sigma_diameter,
+        sigma_tilt=poses.sigma_rad,
+        source=locations.source,
+        flags=flags,
+        frame_id=frame_id,
+    )
 
 
-def _unknown_poses(n: int) -> Poses:
-    nan = np.full((n, 4), np.nan)
-    return Poses(nan, nan[:, :3], nan[:, :3], nan[:, 0], nan[:, 0], np.zeros(n, bool))
+def in_base(picks: Picks, transform: Transform) -> Picks:
+    """Return picks in the target frame of a transform from the frame they are in."""
+    return replace(
+        picks,
+        position=transform.points(picks.position),
+        surface=transform.points(picks.surface),
+        quaternion=transform.rotations(picks.quaternion),
+        axis=transform.directions(picks.axis),
+        sigma_position=transform.spreads(picks.sigma_position),
+        frame_id=transform.frame,
+    )

@@ -18,13 +18,15 @@ def rise(frame: RgbdFrame, region: NDArray[np.bool_]) -> float:
     Least squares of inverse depth on 1, u, v and membership, from every eighth pixel each way: in
     inverse depth the bed is affine in u and v, however the camera is tilted.
     """
-    depth = frame.depth_m[::_STEP, ::_STEP]
+    if frame.depth is None:
+        return float("nan")
+    depth = frame.depth[::_STEP, ::_STEP] * frame.depth_scale
     inside = region[::_STEP, ::_STEP]
-    v, u = np.nonzero(np.isfinite(depth))
+    v, u = np.nonzero((depth > 0) & np.isfinite(depth))
     member = inside[v, u]
     if min(member.sum(), (~member).sum()) < _FEWEST:
         return float("nan")
-    inverse = 1 / depth[v, u].astype(np.float64)
+    inverse = 1 / np.asarray(depth[v, u], np.float64)
     height, width = depth.shape
     columns = np.column_stack([np.ones(len(u)), u / width, v / height, member])
     solution = least_squares(columns, inverse)

@@ -1,46 +1,153 @@
-"""Ids that stay with a mushroom from frame to frame."""
+"""Ids that stay with a mushroom from frame to frame, also under a camera that moves."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields, replace
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
 
-from mushpipe import Circles
+from mushpipe.core.tables import Circles, Columns, Floats, Locations, column
+
+GATE = 0.5  # farthest that a mushroom may be from where it is expected, in radii
+FEWEST = 3  # mushrooms that must agree on a shift
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings(Columns):
+    """Mushrooms and where they were seen.
+
+    Attributes:
+        id: (N,).
+        seen_ns: (N,) when.
+        center: (N, 2) px.
+        radius: (N,) px.
+        position: (N, 3) m, the surface point; NaN without depth.
+        size: (N,) m, radius; NaN where unknown.
+    """
+
+    id: NDArray[np.int64] = column(dtype=np.int64)
+    seen_ns: NDArray[np.int64] = column(dtype=np.int64)
+    center: Floats = column(2)
+    radius: Floats = column()
+    position: Floats = column(3)
+    size: Floats = column()
 
 
 class Tracks:
-    """Assigns circles to those seen before: least total distance, each within half a radius."""
+    """Assigns mushrooms to those seen before: least total distance, each within half a radius.
+
+    Distances are taken in 3D, and in the image where a position is unknown. When the camera moves
+    all mushrooms shift alike; that shift is what most pairs of old and new agree on.
+    """
 
     def __init__(self) -> None:
         self._next = 0
-        self._id = np.zeros(0, np.int64)
-        self._center = np.zeros((0, 2))
-        self._radius = np.zeros(0)
-        self._seen_ns = np.zeros(0, np.int64)
+        self._known = Sightings.unknown(0)
 
-    def update(self, circles: Circles, stamp_ns: int, memory_ns: int) -> NDArray[np.int64]:
-        """Return an id per circle; a track unseen for longer than the memory is forgotten."""
-        ids = np.full(len(circles), -1, np.int64)
-        rows, columns = self._match(circles)
-        ids[rows] = self._id[columns]
-        new = np.flatnonzero(ids < 0)
-        ids[new] = np.arange(self._next, self._next + len(new))
-        self._next += len(new)
-        unseen = np.setdiff1d(np.arange(len(self._id)), columns)
-        unseen = unseen[stamp_ns - self._seen_ns[unseen] <= memory_ns]
-        self._id = np.concatenate([ids, self._id[unseen]])
-        self._center = np.concatenate([circles.center, self._center[unseen]])
-        self._radius = np.concatenate([circles.radius, self._radius[unseen]])
-        now = np.full(len(ids), stamp_ns, np.int64)
-        self._seen_ns = np.concatenate([now, self._seen_ns[unseen]])
+    def update(
+        self,
+        circles: Circles,
+        locations: Locations,
+        image: tuple[int, int],
+        stamp_ns: int,
+        memory_ns: int,
+    ) -> NDArray[np.int64]:
+        """Return an id (N,) per mushroom; one unseen for longer than the memory is forgotten.
+
+        Args:
+            circles: Outlines, px.
+            locations: The same mushrooms in 3D.
+            image: Width and height, px.
+            stamp_ns: When they were seen.
+            memory_ns: How long a mushroom that is not seen is remembered.
+        """
+        new = Sightings(
+            id=np.full(len(circles), -1),
+            seen_ns=np.full(len(circles), stamp_ns),
+            center=circles.center,
+            radius=circles.radius,
+            position=locations.position,
+            size=locations.diameter / 2,
+        )
+        old = _moved(self._known, new, image)
+        rows, columns = _assign(_distances(new, old))
+        ids = new.id.copy()
+        ids[rows] = old.id[columns]
+        fresh = np.flatnonzero(ids < 0)
+        ids[fresh] = self._next + np.arange(len(fresh))
+        self._next += len(fresh)
+        unseen = np.setdiff1d(np.arange(len(old)), columns)
+        unseen = unseen[stamp_ns - old.seen_ns[unseen] <= memory_ns]
+        self._known = _joined(replace(new, id=ids), old.take(unseen))
         return ids
 
-    def _match(self, circles: Circles) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        step = np.linalg.norm(circles.center[:, None] - self._center[None], axis=2)
-        gate = 0.5 * np.minimum(circles.radius[:, None], self._radius[None])
-        # A pair outside its gate costs more than any number of pairs inside theirs.
-        cost = np.where(step <= gate, step / np.maximum(gate, 1e-9), 1e6)
-        rows, columns = linear_sum_assignment(cost)
-        inside = cost[rows, columns] < 1e6
-        return rows[inside], columns[inside]
+
+def _distances(new: Sightings, old: Sightings) -> Floats:
+    """Return how far each new mushroom (N) is from each old one (M), in gates; 1 is the limit."""
+    flat = _steps(new.center, old.center) / _gates(new.radius, old.radius)
+    deep = _steps(new.position, old.position) / _gates(new.size, old.size)
+    return np.where(np.isfinite(deep), deep, flat)
+
+
+def _steps(new: Floats, old: Floats) -> Floats:
+    return cdist(new, old) if len(new) and len(old) else np.zeros((len(new), len(old)))
+
+
+def _gates(new: Floats, old: Floats) -> Floats:
+    return GATE * np.minimum(new[:, None], old[None])
+
+
+def _assign(distances: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the rows and columns of the pairs: as many as there can be, as near as can be."""
+    # A pair outside its gate costs more than any number of pairs inside theirs.
+    cost = np.where(distances <= 1, distances, 1e6)
+    rows, columns = linear_sum_assignment(cost)
+    inside = cost[rows, columns] <= 1
+    return rows[inside], columns[inside]
+
+
+def _moved(old: Sightings, new: Sightings, image: tuple[int, int]) -> Sightings:
+    """Return the old mushrooms where they are expected now.
+
+    They are expected where they were, unless they all shifted: unless a shift brings at least half
+    of those still in view, and more than no shift does, onto new ones.
+    """
+    stayed = _near(new, old).any(axis=0).sum()
+    if min(len(new), len(old)) < FEWEST or stayed > 0.9 * min(len(new), len(old)):
+        return old
+    shifted = replace(old, center=old.center + _common_shift(new, old))
+    near = _near(new, shifted)
+    in_view = ((shifted.center >= 0) & (shifted.center < image)).all(axis=1).sum()
+    if near.any(axis=0).sum() < max(FEWEST, stayed + 1, 0.5 * in_view):
+        return old
+    deep = (new.position[:, None] - old.position[None])[near]
+    known = deep[np.isfinite(deep).all(axis=1)]
+    # without a shift in 3D the assignment falls back to the image
+    step = np.median(known, axis=0) if len(known) else np.full(3, np.nan)
+    return replace(shifted, position=old.position + step)
+
+
+def _near(new: Sightings, old: Sightings) -> NDArray[np.bool_]:
+    """Return which pairs (N, M) lie within a gate in the image."""
+    return np.asarray(_steps(new.center, old.center) <= _gates(new.radius, old.radius))
+
+
+def _common_shift(new: Sightings, old: Sightings) -> Floats:
+    """Return the shift (2,) px that most pairs of old and new circles agree on, by voting."""
+    steps = (new.center[:, None] - old.center[None]).reshape(-1, 2)
+    cells = np.rint(steps / (GATE / 2 * float(np.median(new.radius)))).astype(int)
+    cells -= cells.min(axis=0) - 1  # with a margin, because a peak may lie between cells
+    shape = cells.max(axis=0) + 2
+    votes = np.bincount(np.ravel_multi_index(tuple(cells.T), shape), minlength=shape.prod())
+    around = uniform_filter(votes.reshape(shape).astype(np.float32), 3, mode="constant")
+    peak = np.unravel_index(around.argmax(), around.shape)
+    return np.asarray(np.median(steps[(np.abs(cells - peak) <= 1).all(axis=1)], axis=0))
+
+
+def _joined(first: Sightings, second: Sightings) -> Sightings:
+    columns = [(getattr(first, f.name), getattr(second, f.name)) for f in fields(Sightings)]
+    return Sightings(*map(np.concatenate, columns))

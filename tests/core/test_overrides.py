@@ -6,10 +6,12 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import Field
 
+from mushpipe import Circles, RgbdFrame, Stage
 from mushpipe.core.document import Document, parse_document
 from mushpipe.core.overrides import apply_override
-from tests.core.lab import Lab, cli
+from tests.core.lab import Lab, circles, cli
 
 GRAPH = """
 mushpipe: 1
@@ -194,3 +196,18 @@ def test_source_replaces_one_that_is_broken_or_missing(lab: Lab):
     assert lab.compile(graph, source="frames").source.use == "frames"
     graph = GRAPH.replace("source: {use: frames}\n", "")
     assert lab.compile(graph, "source.count=2", source="frames").source.plugin.count == 2
+
+
+def test_a_setting_goes_by_its_name_in_the_file(lab: Lab):
+    class Keyword(Stage):
+        global_: int = Field(1, alias="global", description="no name for an attribute")
+
+        def process(self, frame: RgbdFrame) -> Circles:
+            return circles(self.global_)
+
+    lab.registry.stage("keyword", Keyword)
+    text = lab.chain("threshold").replace("{use: threshold}", "{use: threshold, global: 3}")
+    plan = lab.compile(text, "a.use=keyword")
+    assert plan.stages[0].plugin.global_ == 3
+    assert plan.warnings == ()
+    assert "did you mean 'global'?" in lab.faults(lab.chain("keyword"), "a.globl=1")

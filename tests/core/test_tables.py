@@ -50,6 +50,7 @@ def picks(**changes):
         "center": np.zeros((2, 2)),
         "radius": [1, 1],
         "position": [[0, 0, 1], [NAN] * 3],
+        "surface": [[0, 0, 1], [NAN] * 3],
         "distance": [1, NAN],
         "diameter": [0.1, NAN],
         "quaternion": np.full((2, 4), NAN),
@@ -136,6 +137,7 @@ WRONG = [
     (poses, {"axis": [[0, 1, 1], [NAN] * 3]}, "Poses: axis must have length 1 (row 0)"),
     (picks, {"id": [7, 7]}, "Picks: ids must be unique (row 0)"),
     (picks, {"position": np.ones((2, 3))}, "Picks: position must be NaN where missing (row 1)"),
+    (picks, {"surface": np.ones((2, 3))}, "Picks: surface must be NaN where missing (row 1)"),
     (picks, {"flags": [0, 0]}, "Picks: DEPTH_MISSING must be set exactly where missing (row 1)"),
     (picks, {"flags": [1, 1]}, "Picks: DEPTH_MISSING must be set exactly where missing (row 0)"),
     (truth, {"id": [1, 1]}, "Truth: ids must be unique (row 0)"),
@@ -159,6 +161,21 @@ def test_a_table_may_have_no_rows(cls):
 
     empty = {f.name: np.zeros((0, *f.metadata["shape"])) for f in fields(cls) if f.metadata}
     assert len(cls(**empty)) == 0
+
+
+def test_rows_of_which_little_is_known():
+    table = Locations.unknown(2, diameter=[0.05, NAN])
+    assert table.diameter[0] == 0.05
+    assert np.isnan(table.position).all()
+    assert table.source.tolist() == [DepthSource.MISSING] * 2
+    assert not Poses.unknown(3).valid.any()
+    assert len(Picks.unknown(0)) == 0
+
+
+def test_rows_are_taken_in_the_order_asked_for():
+    table = picks().take(np.array([1, 0]))
+    assert (table.id.tolist(), table.frame_id) == ([8, 7], "camera")
+    assert len(picks().take(np.array([False, False]))) == 0
 
 
 def test_columns_of_ones_own():

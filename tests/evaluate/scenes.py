@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ from mushpipe.core import wire
 from mushpipe.core.geometry import quaternion_from_axis
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.recording import MANIFEST
-from mushpipe.core.tables import Locations
 from mushpipe.core.truth import TRUTH_TOPIC, Truth
 
 CAMERA = Camera(640, 480, 600.0, 600.0, 319.5, 239.5)
@@ -50,12 +48,6 @@ def tilted(tilt: np.ndarray, turn: np.ndarray) -> np.ndarray:
     return np.stack([sine * np.cos(turn), sine * np.sin(turn), -np.cos(tilt)], axis=1)
 
 
-def rows_of(table: Any, rows: Any) -> Any:
-    """The given rows of a table."""
-    names = [n for n, f in type(table).__dataclass_fields__.items() if "shape" in f.metadata]
-    return replace(table, **{name: getattr(table, name)[rows] for name in names})
-
-
 def picks_of(truth: Truth, **errors: Any) -> Picks:
     """The truth as a graph would find it, with errors added to its columns."""
     n = len(truth)
@@ -68,6 +60,7 @@ def picks_of(truth: Truth, **errors: Any) -> Picks:
         center=truth.center + errors.get("center", 0.0),
         radius=truth.radius + errors.get("radius", 0.0),
         position=position,
+        surface=truth.surface,
         distance=np.linalg.norm(truth.surface, axis=1),
         diameter=truth.diameter + errors.get("diameter", 0.0),
         quaternion=quaternion_from_axis(axis),
@@ -79,20 +72,6 @@ def picks_of(truth: Truth, **errors: Any) -> Picks:
         source=np.full(n, DepthSource.MEASURED, np.uint8),
         flags=np.where(known, 0, PickFlag.POSE_UNKNOWN).astype(np.uint32),
         frame_id=FRAME,
-    )
-
-
-def locations_of(truth: Truth, surface: Any = 0.0) -> Locations:
-    """The truth's surface points, as a stage would locate them."""
-    position = truth.surface + surface
-    nan = np.full(len(truth), np.nan)
-    return Locations(
-        position=position,
-        distance=np.linalg.norm(position, axis=1),
-        diameter=truth.diameter,
-        source=np.full(len(truth), DepthSource.MEASURED, np.uint8),
-        sigma_position=np.repeat(nan[:, None], 3, axis=1),
-        sigma_diameter=nan,
     )
 
 
@@ -115,7 +94,6 @@ def write_results(
     path: Path,
     answers: Mapping[int, Picks],
     truths: Mapping[int, Truth] | None = None,
-    locations: Mapping[int, Locations] | None = None,
     manifest: str = "{}",
     milliseconds: float | None = None,
 ) -> Path:
@@ -125,8 +103,6 @@ def write_results(
         at = header(number)
         if truths and number in truths:
             writer.value(TRUTH_TOPIC, truths[number], at)
-        if locations and number in locations:
-            writer.value("/mushpipe/locate", locations[number], at)
         if number in answers:
             writer.value("/mushpipe/pick", answers[number], at)
         if milliseconds is not None:

@@ -17,9 +17,7 @@ from mushpipe.core.errors import EXIT_DAMAGED, EXIT_DIFFERS, InputError, UsageEr
 from tests.evaluate.scenes import (
     bed,
     header,
-    locations_of,
     picks_of,
-    rows_of,
     write_recording,
     write_results,
 )
@@ -62,8 +60,7 @@ def truths() -> dict[int, Any]:
 @pytest.fixture
 def perfect(tmp_path: Path, truths: dict[int, Any]) -> Path:
     answers = {i: picks_of(truth) for i, truth in truths.items()}
-    located = {i: locations_of(truth) for i, truth in truths.items()}
-    return write_results(tmp_path / "perfect.mcap", answers, truths, located, milliseconds=2.5)
+    return write_results(tmp_path / "perfect.mcap", answers, truths, milliseconds=2.5)
 
 
 @pytest.fixture
@@ -169,7 +166,7 @@ def test_several_results_are_judged_each_and_together(
 ) -> None:
     files = []
     for name, kept in (("a", 20), ("b", 10)):
-        answers = {i: picks_of(rows_of(t, slice(0, kept))) for i, t in truths.items()}
+        answers = {i: picks_of(t.take(slice(0, kept))) for i, t in truths.items()}
         files.append(write_results(tmp_path / f"{name}.mcap", answers, truths))
     (only,) = judged(*files)["alternatives"]
     assert [r["metrics"]["recall"]["value"] for r in only["recordings"]] == [1, 0.5]
@@ -310,7 +307,7 @@ def test_report_is_one_page_of_its_own(graph: Path, tmp_path: Path) -> None:
 
 
 def test_report_of_nothing_found(tmp_path: Path, truths: dict[int, Any]) -> None:
-    nothing = {i: picks_of(rows_of(truth, slice(0, 0))) for i, truth in truths.items()}
+    nothing = {i: picks_of(truth.take(slice(0, 0))) for i, truth in truths.items()}
     results = write_results(tmp_path / "r.mcap", nothing, truths)
     assert run(results, "--report", tmp_path / "report").exit_code == 0
     text = (tmp_path / "report" / "index.html").read_text()
@@ -318,7 +315,7 @@ def test_report_of_nothing_found(tmp_path: Path, truths: dict[int, Any]) -> None
 
 
 def test_report_of_a_frame_with_nothing_in_it(tmp_path: Path) -> None:
-    empty = rows_of(bed(0), slice(0, 0))
+    empty = bed(0).take(slice(0, 0))
     results = write_results(tmp_path / "r.mcap", {0: picks_of(empty)}, {0: empty})
     assert run(results, "--report", tmp_path / "report").exit_code == 0
     assert np.isnan(float(metrics(judged(results))["f"] or "nan"))

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from mushpipe.core.truth import Ignore
 from mushpipe.evaluate.matching import assign, circle_iou, match
 from mushpipe.evaluate.truth import FrameTruth
-from tests.evaluate.scenes import bed, rows_of
+from tests.evaluate.scenes import bed
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -28,7 +28,7 @@ def circles(*rows: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
 
 def truth_at(*rows: tuple[float, float, float], ignore: tuple[int, ...] = ()) -> FrameTruth:
     center, radius = circles(*rows)
-    caps = rows_of(bed(0), slice(0, len(rows)))
+    caps = bed(0).take(slice(0, len(rows)))
     reasons = np.array([*ignore, *[0] * (len(rows) - len(ignore))], np.uint8)
     return FrameTruth(replace(caps, center=center, radius=radius, ignore=reasons))
 

@@ -16,14 +16,14 @@ from mushpipe.evaluate.events import Verdict, comparable, events_of, judge
 from mushpipe.evaluate.metrics import METRICS, measure
 from mushpipe.evaluate.results import of_circles, of_picks
 from mushpipe.evaluate.truth import FrameTruth
-from tests.evaluate.scenes import FRAME, bed, header, locations_of, picks_of, rows_of, tilted
+from tests.evaluate.scenes import FRAME, bed, header, picks_of, tilted
 
 
 def verdict(truth: Truth, picks: Picks, number: int = 0, surface: Any = 0.0) -> Verdict:
-    locations = locations_of(truth, surface) if len(truth) == len(picks) else None
+    picks = replace(picks, surface=picks.surface + surface)
     known = FrameTruth(truth, frame_id=FRAME)
     at = header(number)
-    return judge("bed", ("stamp_ns", at.stamp_ns), known, at, of_picks(picks, locations))
+    return judge("bed", ("stamp_ns", at.stamp_ns), known, at, of_picks(picks))
 
 
 def values_of(*verdicts: Verdict, up: Any = (0, 0, -1)) -> dict[str, float]:
@@ -74,7 +74,7 @@ def test_injected_errors_are_recovered(
 ) -> None:
     rng = np.random.default_rng(seed)
     truth = bed(seed)
-    kept = rows_of(truth, np.sort(rng.permutation(20)[dropped:]))
+    kept = truth.take(np.sort(rng.permutation(20)[dropped:]))
     extra = replace(
         bed(seed, 1, added),
         center=np.array([[90.0 * i, 20] for i in range(added)]).reshape(-1, 2),
@@ -122,7 +122,7 @@ def _joined(a: Picks, b: Picks) -> Picks:
 
 
 def test_hand_computed_errors() -> None:
-    truth = rows_of(bed(1), slice(0, 3))
+    truth = bed(1).take(slice(0, 3))
     picks = picks_of(
         truth,
         center=[[3, 4], [0, 0], [0, 0]],
@@ -150,7 +150,7 @@ def test_a_flipped_axis_is_wrong_by_180_degrees() -> None:
 
 
 def test_upright_is_the_tilt_against_the_given_gravity() -> None:
-    truth = rows_of(bed(3), slice(0, 2))
+    truth = bed(3).take(slice(0, 2))
     truth = replace(truth, axis=tilted(np.radians([10.0, 20.0]), np.zeros(2)))
     picks = picks_of(truth, axis=tilted(np.radians([14.0, 18.0]), np.zeros(2)))
     assert values_of(verdict(truth, picks))["upright_mean_deg"] == pytest.approx(15)
@@ -212,9 +212,9 @@ def test_a_sigma_of_zero_is_none() -> None:
 def test_empty_cases_invent_nothing(case: str) -> None:
     truth, picks = bed(8), picks_of(bed(8))
     if case == "no truth":
-        truth = rows_of(truth, slice(0, 0))
+        truth = truth.take(slice(0, 0))
     if case == "nothing found":
-        picks = picks_of(rows_of(truth, slice(0, 0)))
+        picks = picks_of(truth.take(slice(0, 0)))
     if case == "nothing matched":
         picks = picks_of(truth, radius=200.0)
     verdicts = [] if case == "no frame" else [verdict(truth, picks)]
@@ -276,7 +276,7 @@ def test_paired_differences_are_those_of_the_frames() -> None:
     for i in range(10):
         hard = rng.normal(0, 2)  # shared by both, so it must not widen the interval
         base.append(verdict(bed(i), picks_of(bed(i), radius=hard), i))
-        dropped = rows_of(bed(i), slice(2, None))
+        dropped = bed(i).take(slice(2, None))
         other.append(verdict(bed(i), picks_of(dropped, radius=hard + 0.5), i))
     result = differences(events_of(base), events_of(other), 10, resamples=300)
     assert result["recall"].value == pytest.approx(-0.1)
@@ -290,7 +290,7 @@ def test_paired_differences_are_those_of_the_frames() -> None:
 def test_a_single_frame_is_paired_by_its_mushrooms() -> None:
     truth = bed(13)
     base = events_of([verdict(truth, picks_of(truth))])
-    other = events_of([verdict(truth, picks_of(rows_of(truth, slice(4, None))))])
+    other = events_of([verdict(truth, picks_of(truth.take(slice(4, None))))])
     result = differences(base, other, 1, resamples=200)["recall"]
     assert result.value == pytest.approx(-0.2)
     assert -0.5 < result.low < -0.2 < result.high < 0

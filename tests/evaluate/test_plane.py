@@ -4,13 +4,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from typer.testing import CliRunner
 
 from mushpipe import RgbdFrame
 from mushpipe.cli import app
 from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.recorder import RecordingWriter
+from mushpipe.evaluate.calibrate import fit_correction
 from mushpipe.evaluate.plane import judge_planes, measure_plane, plane_values, window_of
+from mushpipe.sources.mcap import McapSource
+from mushpipe.stages.depth_correct import DepthCorrect
 from tests.evaluate.scenes import frame
 
 
@@ -102,3 +106,42 @@ def test_command(tmp_path: Path) -> None:
     assert result.exit_code == 0
     assert "offset mm" in result.stdout
     assert "2.8" in result.stdout
+
+
+def test_a_calibration_takes_off_what_was_put_in(tmp_path: Path) -> None:
+    """Planes whose error is 2 mm + 1.5 mm/m z come out where they are."""
+    distances = (0.4, 0.6, 0.8)
+    files = [
+        plane(tmp_path, z, (0.002 + 0.0015 * z) / (1 - 0.0015), 0.0005, seed=i)
+        for i, z in enumerate(distances)
+    ]
+    options = ["--plane", "0.4,0.6,0.8", "--order", "1", "-o", str(tmp_path / "depth.yaml")]
+    result = CliRunner().invoke(app, ["calibrate", "depth", *map(str, files), *options])
+    assert result.exit_code == 0, result.output
+    assert "offset mm" in result.stdout
+    stage = DepthCorrect(calibration=tmp_path / "depth.yaml")
+    stage.open()
+    for file, distance in zip(files, distances, strict=True):
+        for one in McapSource(path=file).frames():
+            middle = stage.process(one).depth_m[200:280, 280:360]
+            assert middle.mean() == pytest.approx(distance, abs=5e-5)
+
+
+def test_a_calibration_needs_more_distances_than_its_order(tmp_path: Path) -> None:
+    row = measure_plane(plane(tmp_path, 0.51, 0.003, 0.001), 0.51, resamples=0)
+    found = fit_correction([row], 0)
+    assert found.coefficients == pytest.approx([3, 0, 0], abs=0.1)
+    assert found.left == pytest.approx([0])
+    with pytest.raises(UsageError, match="--order 1 needs 2 distances, there are 1"):
+        fit_correction([row, row], 1)
+
+
+def test_a_calibration_that_is_none_is_refused(tmp_path: Path) -> None:
+    for text in ("offset: 3\n", "offset_mm: far\n", "calibration: x.yaml\n"):
+        (tmp_path / "bad.yaml").write_text(text)
+        with pytest.raises(InputError, match=r"bad\.yaml: no calibration of depth"):
+            DepthCorrect(calibration=tmp_path / "bad.yaml").open()
+    with pytest.raises(InputError, match="there is no such file"):
+        DepthCorrect(calibration=tmp_path / "none.yaml").open()
+    with pytest.raises(ValidationError, match="either here or in the file"):
+        DepthCorrect(calibration=tmp_path / "bad.yaml", offset_mm=1)

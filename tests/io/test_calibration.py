@@ -80,10 +80,18 @@ def test_intrinsics_may_be_given(tmp_path: Path, caplog: pytest.LogCaptureFixtur
     assert not any("no calibration" in text for text in caplog.messages)
 
 
-def test_distortion_is_kept(tmp_path: Path) -> None:
-    d = (0.1, -0.2, 0.001, 0.002, 0.05)
-    expected = Camera(WIDTH, HEIGHT, FX, FY, CX, CY, "brown_conrady", d)
-    assert cameras(tmp_path, [info_at(0, d=d), *COLORS]) == [expected] * 3
+@pytest.mark.parametrize(
+    ("wire", "model", "count"),
+    [
+        ("plumb_bob", "brown_conrady", 5),
+        ("inverse_brown_conrady", "inverse_brown_conrady", 5),
+        ("rational_polynomial", "rational", 8),
+    ],
+)
+def test_distortion_is_kept(tmp_path: Path, wire: str, model: str, count: int) -> None:
+    d = (0.1, -0.2, 0.001, 0.002, 0.05, 0.03, 0.02, 0.01)[:count]
+    expected = Camera(WIDTH, HEIGHT, FX, FY, CX, CY, model, d)
+    assert cameras(tmp_path, [info_at(0, d=d, model=wire), *COLORS]) == [expected] * 3
 
 
 @pytest.mark.parametrize("model", ["plumb_bob", "equidistant", ""])
@@ -92,7 +100,7 @@ def test_distortion_of_zeros_is_none(model: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("model", "d"), [("equidistant", (0.1, 0.2, 0.3, 0.4)), ("rational_polynomial", (0.1,) * 8)]
+    ("model", "d"), [("equidistant", (0.1, 0.2, 0.3, 0.4)), ("rational_polynomial", (0.1,) * 14)]
 )
 def test_an_unsupported_lens_model_is_reported_after_the_frames(
     model: str, d: tuple[float, ...], tmp_path: Path

@@ -53,6 +53,7 @@ def make_picks() -> Picks:
         center=circles.center,
         radius=circles.radius,
         position=np.array([[0.1, -0.2, 0.5], [NAN] * 3]),
+        surface=np.array([[0.1, -0.2, 0.5], [NAN] * 3]),
         distance=np.array([0.55, NAN]),
         diameter=np.array([0.04, NAN]),
         quaternion=np.array([[0, 0, 0.6, 0.8], [NAN] * 4]),

@@ -45,6 +45,7 @@ def make_picks(n: int = 3, **changes: Any) -> Picks:
         "center": np.full((n, 2), 100.0),
         "radius": np.full(n, 20.0),
         "position": np.column_stack([np.arange(n) / 1000, np.zeros(n), np.full(n, 0.5)]),
+        "surface": np.tile([0.0, 0.0, 0.5], (n, 1)),
         "distance": np.full(n, 0.5),
         "diameter": np.full(n, 0.04),
         "quaternion": np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
@@ -56,7 +57,10 @@ def make_picks(n: int = 3, **changes: Any) -> Picks:
         "source": np.ones(n),
         "flags": np.zeros(n),
     }
-    return Picks(**{**columns, **changes}, frame_id=FRAME)
+    columns |= changes
+    missing = np.asarray(columns["source"]) == 0
+    columns["surface"] = np.where(missing[:, None], np.nan, columns["surface"])
+    return Picks(**columns, frame_id=FRAME)
 
 
 def choice(n: int = 3, **changes: Any) -> Choice:

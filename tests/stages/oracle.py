@@ -1,36 +1,11 @@
-"""References that share no code with the product: exact minima, naive loops, scipy's operators."""
+"""References that share no code with the product: naive loops and scipy's operators."""
 
 from __future__ import annotations
 
 import math
 
-import maxflow
 import numpy as np
 from scipy import ndimage
-
-AXIAL = np.array([[0, 0, 0], [0, 0, 1], [0, 1, 0]])
-DIAGONAL = np.array([[0, 0, 0], [0, 0, 0], [1, 0, 1]])
-
-
-def graph_cut(gray: np.ndarray, initial: np.ndarray, mu: float, rounds: int = 4) -> np.ndarray:
-    """The exact minimum for given means, alternating with them."""
-    region = initial
-    for _ in range(rounds):
-        if region.all() or not region.any():
-            break
-        c1, c2 = gray[region].mean(), gray[~region].mean()
-        graph = maxflow.Graph[float]()
-        nodes = graph.add_grid_nodes(gray.shape)
-        weight = mu * math.pi / 8
-        graph.add_grid_edges(nodes, weight, structure=AXIAL, symmetric=True)
-        graph.add_grid_edges(nodes, weight / math.sqrt(2), structure=DIAGONAL, symmetric=True)
-        graph.add_grid_tedges(nodes, (gray - c2) ** 2, (gray - c1) ** 2)
-        graph.maxflow()
-        new = ~graph.get_grid_segments(nodes)
-        if (new == region).all():
-            break
-        region = new
-    return region
 
 
 def naive_energy(image: np.ndarray, region: np.ndarray, mu: float) -> float:

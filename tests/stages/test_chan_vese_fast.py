@@ -4,12 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.graph_cut import graph_cut
 from mushpipe.stages.chan_vese import ChanVese
 from mushpipe.stages.chan_vese_energy import chan_vese_energy
 from mushpipe.stages.chan_vese_fast import solve_fast
 from mushpipe.stages.otsu import otsu_foreground
 from tests.stages.frames import RECORDINGS, recorded, simulated
-from tests.stages.oracle import graph_cut
 from tests.stages.scenes import discs, frame_of
 
 MU = 0.1

@@ -2,16 +2,16 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from pydantic import ValidationError
+from scipy.spatial.transform import Rotation
 
-from mushpipe import Circles, DepthSource, Locations, PickFlag, Poses
+from mushpipe import Circles, DepthSource, Locations, PickFlag, Picks, Poses
 from mushpipe.stages.picks import MakePicks
-from mushpipe.stages.tracks import Tracks
-from tests.stages.scenes import frame_of
+from tests.stages.scenes import CAMERA, frame_of
 
 NAN = np.nan
 
@@ -25,6 +25,7 @@ def locations(*sources: DepthSource) -> Locations:
     n = len(sources)
     present = np.array(sources) != DepthSource.MISSING
     position = np.where(present[:, None], [[0.01, 0.02, 0.5]], NAN)
+    position[:, 0] += 0.1 * np.arange(n)
     return Locations(
         position,
         np.linalg.norm(position, axis=1),
@@ -42,13 +43,14 @@ def test_flags_say_what_is_not_measured() -> None:
     )
     picks = MakePicks().process(frame_of(np.zeros((120, 160))), circles, found)
     unknown = PickFlag.POSE_UNKNOWN
-    assert [PickFlag(f) for f in picks.flags.tolist()] == [
+    flags = picks.flags[np.argsort(picks.id)].tolist()
+    assert [PickFlag(f) for f in flags] == [
         unknown,
         unknown | PickFlag.DEPTH_ESTIMATED,
         unknown | PickFlag.DEPTH_MISSING,
         unknown | PickFlag.AT_BORDER,
     ]
-    assert np.isnan(picks.position[2]).all()
+    assert np.isnan(picks.position[picks.id == 2]).all()
     assert np.isnan(picks.quaternion).all()
     assert picks.frame_id == "camera_color_optical_frame"
 
@@ -65,7 +67,7 @@ def test_the_apex_stands_in_for_the_surface_only_where_the_pose_is_valid() -> No
     )
     found = locations(DepthSource.MEASURED, DepthSource.MEASURED)
     picks = MakePicks().process(frame_of(np.zeros((120, 160))), circles, found, poses)
-    assert picks.position.tolist() == [[0.0, 0.0, 0.48], [0.01, 0.02, 0.5]]
+    assert picks.position.tolist() == [[0.0, 0.0, 0.48], [0.11, 0.02, 0.5]]
     assert [bool(f & PickFlag.POSE_UNKNOWN) for f in picks.flags] == [False, True]
 
 
@@ -78,7 +80,7 @@ def test_rows_must_agree() -> None:
         )
 
 
-def test_the_end_of_a_run_says_how_many_picks_have_no_position(
+def test_the_end_of_a_run_says_how_many_have_no_position(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     stage = MakePicks()
@@ -86,7 +88,7 @@ def test_the_end_of_a_run_says_how_many_picks_have_no_position(
     stage.process(frame_of(np.zeros((120, 160))), circles_at((50, 50), (80, 50)), found)
     with caplog.at_level(logging.WARNING, "mushpipe"):
         stage.close()
-    assert "1 of 2 picks have no position: there is no depth at them" in caplog.messages
+    assert "1 of 2 mushrooms have no position: there is no depth at them" in caplog.messages
 
 
 def test_an_empty_bed_gives_empty_picks() -> None:
@@ -94,35 +96,148 @@ def test_an_empty_bed_gives_empty_picks() -> None:
     assert len(picks) == 0
 
 
-@given(st.randoms(), st.integers(1, 12))
-def test_ids_follow_their_mushroom_whatever_the_order(rng: object, n: int) -> None:
-    centers = [(20.0 * i, 30.0) for i in range(n)]
-    tracks = Tracks()
-    first = tracks.update(circles_at(*centers), 0, 10)
-    order = list(range(n))
-    rng.shuffle(order)  # type: ignore[attr-defined]
-    moved = [(centers[i][0] + 2.0, 31.0) for i in order]
-    assert tracks.update(circles_at(*moved), 1, 10).tolist() == first[order].tolist()
-
-
-def test_an_id_survives_a_gap_within_the_memory_and_is_never_used_again() -> None:
-    tracks = Tracks()
-    here, elsewhere = circles_at((50, 50)), circles_at((90, 90))
-    assert tracks.update(here, 0, 10).tolist() == [0]
-    assert tracks.update(elsewhere, 5, 10).tolist() == [1]
-    assert tracks.update(here, 10, 10).tolist() == [0]
-    assert tracks.update(circles_at(), 21, 10).tolist() == []
-    assert tracks.update(here, 40, 10).tolist() == [2]
-
-
-def test_a_jump_of_more_than_half_a_radius_is_another_mushroom() -> None:
-    tracks = Tracks()
-    tracks.update(circles_at((50, 50)), 0, 10)
-    assert tracks.update(circles_at((54.1, 50)), 1, 10).tolist() == [1]
-
-
 def test_picks_are_in_the_frame_of_their_image() -> None:
     frame = frame_of(np.zeros((120, 160)))
     other = replace(frame, header=replace(frame.header, frame_id="another_optical_frame"))
     picks = MakePicks().process(other, circles_at((50, 50)), locations(DepthSource.MEASURED))
     assert picks.frame_id == "another_optical_frame"
+
+
+def bed(*rows: tuple[float, float, float, float]) -> tuple[Circles, Locations]:
+    """Mushrooms at u, v (px), z and diameter (m); a z of NaN is missing."""
+    u, v, z, size = np.array(rows).T
+    center, radius = np.stack([u, v], axis=1), np.full(len(u), 12.0)
+    position = CAMERA.deproject(center, z)
+    missing = np.isnan(position).any(axis=1)
+    position[missing] = NAN
+    found = Locations.unknown(
+        len(u),
+        position=position,
+        distance=np.linalg.norm(position, axis=1),
+        diameter=size,
+        source=np.where(missing, DepthSource.MISSING, DepthSource.MEASURED),
+    )
+    return Circles(center, radius, np.linspace(0.9, 0.5, len(u))), found
+
+
+def picked(rows: list[tuple[float, float, float, float]], **settings: Any) -> Picks:
+    circles, found = bed(*rows)
+    return MakePicks(**settings).process(frame_of(np.zeros((120, 160))), circles, found)
+
+
+# id 1 is the highest and hides half of id 0, which is higher than id 2; id 3 has no depth
+BED = [(40, 60, 0.45, 0.04), (52, 60, 0.40, 0.05), (120, 60, 0.50, 0.03), (80, 30, NAN, NAN)]
+
+
+def test_the_highest_comes_first_what_is_hidden_later_what_has_no_depth_last() -> None:
+    picks = picked(BED)
+    assert picks.id.tolist() == [1, 2, 0, 3]
+    assert ((picks.flags & PickFlag.OCCLUDED) > 0).tolist() == [False, False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("order", "ids"),
+    [
+        (("highest",), [1, 0, 2, 3]),
+        (("largest",), [1, 0, 2, 3]),
+        (("score",), [0, 1, 2, 3]),
+        (("unoccluded", "score"), [1, 2, 0, 3]),
+        ((), [0, 1, 2, 3]),
+    ],
+)
+def test_other_orders(order: tuple[str, ...], ids: list[int]) -> None:
+    assert picked(BED, order=order).id.tolist() == ids
+
+
+def test_what_is_not_wanted_is_left_out() -> None:
+    assert picked(BED, min_score=0.7).id.tolist() == [1, 0]
+    assert picked(BED, diameter_mm=(35, 60)).id.tolist() == [1, 0]
+    assert picked(BED, withhold=("occluded", "depth_missing")).id.tolist() == [1, 2]
+    with pytest.raises(ValidationError, match="smallest and the largest"):
+        picked(BED, diameter_mm=(60, 35))
+
+
+def test_every_flag_can_be_withheld() -> None:
+    for flag in PickFlag:
+        assert flag.name is not None
+        MakePicks(withhold=(flag.name.lower(),))  # type: ignore[arg-type]
+
+
+def test_the_hidden_share_is_that_of_the_circles() -> None:
+    # Two circles of radius r whose centres are r apart share 2/3 - sqrt(3)/(2 pi) of their area.
+    share = 2 / 3 - np.sqrt(3) / (2 * np.pi)
+    rows = [(40, 60, 0.45, 0.04), (52, 60, 0.40, 0.05)]
+    for margin, flagged in ((-0.03, True), (0.03, False)):
+        picks = picked(rows, occluded_share=share + margin)
+        assert ((picks.flags & PickFlag.OCCLUDED) > 0).tolist() == [False, flagged]
+
+
+def test_room_for_the_gripper_is_the_gap_between_the_outlines() -> None:
+    # 80 px at 0.5 m and f = 200 px are 200 mm between centres, 160 mm between outlines.
+    rows = [(40, 60, 0.5, 0.04), (120, 60, 0.5, 0.04), (80, 30, NAN, NAN)]
+    for clearance, flagged in ((159, False), (161, True)):
+        picks = picked(rows, clearance_mm=clearance)
+        close = (picks.flags & PickFlag.TOO_CLOSE_TO_NEIGHBOUR) > 0
+        assert close.tolist() == [flagged, flagged, False]
+    alone = picked(rows[:1], clearance_mm=500)
+    assert not alone.flags[0] & PickFlag.TOO_CLOSE_TO_NEIGHBOUR
+
+
+def test_a_tilt_that_is_a_guess_is_flagged() -> None:
+    circles, found = bed(*BED[:2])
+    poses = Poses.unknown(
+        2,
+        quaternion=np.tile([1.0, 0, 0, 0], (2, 1)),
+        axis=np.tile([0.0, 0, -1], (2, 1)),
+        apex=found.position,
+        sigma_rad=np.radians([9.0, 11.0]),
+        valid=[True, True],
+    )
+    picks = MakePicks().process(frame_of(np.zeros((120, 160))), circles, found, poses)
+    flagged = picks.id[(picks.flags & PickFlag.TILT_UNOBSERVABLE) > 0]
+    assert flagged.tolist() == [1]
+
+
+def test_picks_are_given_in_the_robots_frame() -> None:
+    """Against SciPy's rotations, of a camera that looks down aslant."""
+    circles, found = bed(*BED)
+    rng = np.random.default_rng(3)
+    own = Rotation.from_euler("xyz", rng.normal(0, 0.2, (4, 3))) * Rotation.from_quat([1, 0, 0, 0])
+    valid = np.array([True, True, True, False])
+    poses = Poses(
+        quaternion=np.where(valid[:, None], own.as_quat(), NAN),
+        axis=np.where(valid[:, None], own.apply([0, 0, 1]), NAN),
+        apex=np.where(valid[:, None], found.position - [0, 0, 0.001], NAN),
+        sigma_rad=np.full(4, 0.1),
+        fitness=np.ones(4),
+        valid=valid,
+    )
+    frame = frame_of(np.zeros((120, 160)))
+    plain = MakePicks(order=()).process(frame, circles, found, poses)
+    mount = Rotation.from_euler("zyx", [30, 10, 170], degrees=True)
+    setting = {"frame": "base", "translation": [1, 2, 3], "quaternion": mount.as_quat().tolist()}
+    moved = MakePicks(order=(), T_base_camera=setting).process(frame, circles, found, poses)
+    assert (plain.frame_id, moved.frame_id) == ("camera_color_optical_frame", "base")
+    for name in ("position", "surface"):
+        expected = getattr(plain, name) @ mount.as_matrix().T + [1, 2, 3]
+        np.testing.assert_allclose(getattr(moved, name), expected, atol=1e-12)
+    np.testing.assert_allclose(moved.axis, plain.axis @ mount.as_matrix().T, atol=1e-12)
+    # the quaternion still takes +z to the axis
+    turned = Rotation.from_quat(moved.quaternion[valid]).apply([0, 0, 1])
+    np.testing.assert_allclose(turned, moved.axis[valid], atol=1e-9)
+    assert np.isnan(moved.quaternion[3]).all()
+    assert moved.distance.tolist()[:3] == plain.distance.tolist()[:3]
+
+
+def test_height_is_z_of_the_robots_frame() -> None:
+    # A robot whose z points along the camera's sight: what is far is high.
+    along = {"frame": "base", "translation": [0, 0, 0], "quaternion": [0, 0, 0, 1]}
+    assert picked(BED, order=("highest",), T_base_camera=along).id.tolist() == [2, 0, 1, 3]
+
+
+def test_spreads_turn_with_the_axes() -> None:
+    circles, found = bed(BED[0])
+    found = replace(found, sigma_position=[[0.001, 0.002, 0.003]])
+    quarter = {"frame": "b", "translation": [0, 0, 0], "quaternion": [0, 0, 0.5**0.5, 0.5**0.5]}
+    picks = MakePicks(T_base_camera=quarter).process(frame_of(np.zeros((120, 160))), circles, found)
+    assert picks.sigma_position[0] == pytest.approx([0.002, 0.001, 0.003])

@@ -1,0 +1,90 @@
+"""Rigid transforms between frames, `T_target_source`, as settings of a graph."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, field_validator
+
+from mushpipe.core.stage import resolve_path
+from mushpipe.core.tables import Floats
+
+UNIT_TOLERANCE = 1e-3
+
+
+class Transform(BaseModel):
+    """Takes what is expressed in a source frame to a target frame: p_target = R p_source + t."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    frame: str = Field(min_length=1, max_length=64, description="name of the target frame")
+    translation: tuple[float, float, float] = Field(
+        description="origin of the source frame in the target frame, m"
+    )
+    quaternion: tuple[float, float, float, float] = Field(
+        description="rotation from the source frame to the target frame, x y z w"
+    )
+
+    @field_validator("quaternion")
+    @classmethod
+    def _unit(cls, value: tuple[float, ...]) -> tuple[float, ...]:
+        if abs(np.linalg.norm(value) - 1) > UNIT_TOLERANCE:
+            raise ValueError("the quaternion must have length 1")
+        return value
+
+    def points(self, points: Floats) -> Floats:
+        """Transform (N, 3) points, m; rows of NaN stay NaN."""
+        return np.asarray(self.directions(points) + self.translation)
+
+    def directions(self, vectors: Floats) -> Floats:
+        """Turn (N, 3) vectors; rows of NaN stay NaN."""
+        return np.asarray(vectors @ self._matrix().T)
+
+    def spreads(self, sigmas: Floats) -> Floats:
+        """Turn (N, 3) standard deviations along x, y, z, which are taken for independent."""
+        return np.sqrt(sigmas**2 @ (self._matrix() ** 2).T)
+
+    def rotations(self, quaternions: Floats) -> Floats:
+        """Turn (N, 4) orientations, x y z w; rows of NaN stay NaN."""
+        from scipy.spatial.transform import Rotation
+
+        turned = quaternions.copy()
+        known = np.isfinite(quaternions).all(axis=1)
+        if known.any():
+            own = Rotation.from_quat(self.quaternion)
+            turned[known] = (own * Rotation.from_quat(quaternions[known])).as_quat()
+        return turned
+
+    def _matrix(self) -> Floats:
+        from scipy.spatial.transform import Rotation
+
+        return np.asarray(Rotation.from_quat(self.quaternion).as_matrix())
+
+
+def _read(value: Any, info: ValidationInfo) -> Any:
+    """Replace the name of a YAML file by the transform that stands in it."""
+    if isinstance(value, dict):  # a list is no tuple to a validator that follows another
+        return {key: tuple(v) if isinstance(v, list) else v for key, v in value.items()}
+    if not isinstance(value, str):
+        return value
+    import json
+
+    from mushpipe.core.document import read_document
+    from mushpipe.core.errors import GraphError
+
+    path = resolve_path(Path(value), info)
+    try:
+        return Transform.model_validate_json(json.dumps(read_document(path).data))
+    except (GraphError, ValueError) as error:
+        raise ValueError(
+            f"no transform in {path}: {error}; expected frame, translation: [x, y, z] in m and "
+            "quaternion: [x, y, z, w]"
+        ) from error
+
+
+TransformSetting = Annotated[
+    Transform, BeforeValidator(_read, json_schema_input_type=Transform | str)
+]
+"""A `Transform` as a setting: written out, or the name of a YAML file with the same keys."""

@@ -1,0 +1,188 @@
+"""Paraboloids fitted to the depth of all caps of a frame."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mushpipe.core.jit import jit
+from mushpipe.stages.cap_batch import rank_by_depth
+from mushpipe.stages.cap_samples import CELLS, GRID, block, ray_at
+
+Floats = NDArray[np.float64]
+COEFFICIENTS = 6
+ROUNDS = 4
+DISC = 0.6  # points within so many radii; farther out a cap falls off faster than a paraboloid
+EFFECTIVE = 0.5  # as in cap-fit: so much of a point's information is its own
+SHAPE_M = 0.0004  # sigma of a cap about a paraboloid
+BEND = 0.3  # sigma of the quadratic coefficients about those of a cap, in radii
+ASPECT = 0.62  # height of a dome over the radius of its rim
+INNER = CELLS[(CELLS**2).sum(axis=1) < DISC**2]
+
+
+@jit
+def fit_surfaces(
+    image: Any,
+    discs: Floats,
+    focal: float,
+    noise: tuple[float, float],
+    least: int,
+    out: tuple[Floats, Floats],
+) -> NDArray[np.int64]:
+    """Fit z = b0 + b1 x + b2 y + b3 x^2 + b4 x y + b5 y^2 to every cap, x and y in its radii.
+
+    Args:
+        image: Depth (H, W) m, rays (H, W, 2), and ranks (H, W) full of N.
+        discs: (N, 3) x, y, radius, px.
+        focal: Focal length, px.
+        noise: Sigma of depth is noise[0] + noise[1] z, m.
+        least: Fewest points.
+        out: Coefficients (N, 6) m and covariances (N, 6, 6); those without a fit stay as they are.
+
+    Returns:
+        (N,) how many points of the whole grid have depth.
+    """
+    rank = rank_by_depth(image[0], discs, image[2])
+    near = np.empty((COEFFICIENTS + 2, len(INNER)))
+    seen = np.zeros(len(discs), np.int64)
+    for i in range(len(discs)):
+        n, middle = sample_inner(image, rank[i], discs[i], focal, noise, near)
+        size = discs[i, 2] * middle / focal
+        if n >= least and paraboloid(near[:, :n], size, out[0][i], out[1][i]):
+            out[0][i, 0] += middle
+            seen[i] = count_seen(image, rank[i], discs[i], (middle - 0.8 * size, middle + size))
+    return seen
+
+
+@jit
+def sample_inner(
+    image: Any, rank: int, disc: Floats, focal: float, noise: tuple[float, float], out: Floats
+) -> tuple[int, float]:
+    """Take block means on a grid in the inner part of a circle; arguments as `fit_surfaces`.
+
+    Args:
+        image: Depth, rays and ranks.
+        rank: This circle's.
+        disc: (3,) x, y, radius, px.
+        focal: Focal length, px.
+        noise: Sigma of depth.
+        out: (8, M) out: the six terms of the paraboloid, depth about the middle (m), variance.
+
+    Returns:
+        Number of points, and the middle depth (m), 0 without any.
+    """
+    half = max(0, int(np.floor(disc[2] / GRID)))
+    full = (2 * half + 1) ** 2
+    means, counts = np.empty((len(INNER), 4)), np.empty(len(INNER))
+    center = ray_at(image[1], focal, disc[0], disc[1])
+    n = 0
+    for j in range(len(INNER)):
+        u = int(np.floor(disc[0] + disc[2] * INNER[j, 0] + 0.5))
+        v = int(np.floor(disc[1] + disc[2] * INNER[j, 1] + 0.5))
+        counts[n] = block(image[0], image[1], image[2], rank, (u, v, half), means[n])
+        n += counts[n] > 0.4 * full
+    if n == 0:
+        return 0, 0.0
+    middle = float(np.median(means[:n, 2]))
+    size = disc[2] * middle / focal
+    sigma = noise[0] + noise[1] * middle
+    even = (2.5 * sigma) ** 2 + (0.6 * size * (2 * half + 1) / disc[2]) ** 2
+    m = 0
+    for j in range(n):
+        z = means[j, 2]
+        if means[j, 3] > even or not middle - 0.8 * size < z < middle + size:
+            continue
+        x = (means[j, 0] - center[0] / center[2]) * focal / disc[2]
+        y = (means[j, 1] - center[1] / center[2]) * focal / disc[2]
+        out[0, m], out[1, m], out[2, m] = 1.0, x, y
+        out[3, m], out[4, m], out[5, m] = x * x, x * y, y * y
+        out[6, m] = z - middle
+        # part of the noise is shared by neighbouring pixels
+        out[7, m] = (sigma * (0.3 + 0.7 / np.sqrt(counts[j]))) ** 2 + SHAPE_M * SHAPE_M
+        m += 1
+    return m, middle
+
+
+@jit
+def count_seen(image: Any, rank: int, disc: Floats, gate: tuple[float, float]) -> int:
+    """Return on how many points of the whole grid a cap has depth within its gate (m)."""
+    depth, _, ranks = image
+    count = 0
+    for j in range(len(CELLS)):
+        u = int(np.floor(disc[0] + disc[2] * CELLS[j, 0] + 0.5))
+        v = int(np.floor(disc[1] + disc[2] * CELLS[j, 1] + 0.5))
+        if 0 <= v < depth.shape[0] and 0 <= u < depth.shape[1] and ranks[v, u] >= rank:
+            count += gate[0] < depth[v, u] < gate[1]
+    return count
+
+
+@jit
+def paraboloid(points: Floats, size: float, surface: Floats, covariance: Floats) -> bool:
+    """Fit one paraboloid by least squares with Tukey's weights; False where it is not determined.
+
+    Args:
+        points: (8, M) the six terms, depth about a middle one (m) and its variance.
+        size: Radius of the cap, m: the scale of what bends are expected.
+        surface: (6,) out.
+        covariance: (6, 6) out.
+    """
+    count = points.shape[1]
+    weighted, right = np.empty((COEFFICIENTS, count)), np.empty(COEFFICIENTS)
+    for k in range(ROUNDS):
+        cut = (100.0, 36.0, 16.0, 16.0)[k]
+        for j in range(count):
+            error = 0.0  # all count alike at first
+            if k > 0:
+                error = points[6, j]
+                for i in range(COEFFICIENTS):
+                    error -= surface[i] * points[i, j]
+            rest = max(1.0 - error * error / (cut * points[7, j]), 0.0)
+            weight = EFFECTIVE * rest * rest / points[7, j]
+            for i in range(COEFFICIENTS):
+                weighted[i, j] = weight * points[i, j]
+        for i in range(COEFFICIENTS):
+            right[i] = dot(weighted[i], points[6], count)
+            for m in range(i + 1):
+                covariance[i, m] = covariance[m, i] = dot(weighted[i], points[m], count)
+        for i in range(3, COEFFICIENTS):
+            known = 1.0 / (BEND * size) ** 2
+            covariance[i, i] += known
+            right[i] += known * (0.5 * ASPECT * size if i != 4 else 0.0)
+        if not invert(covariance):
+            surface[:], covariance[:] = np.nan, np.nan
+            return False
+        for i in range(COEFFICIENTS):
+            surface[i] = dot(covariance[i], right, COEFFICIENTS)
+    return True
+
+
+@jit
+def dot(a: Floats, b: Floats, count: int) -> float:
+    """Return the sum of products of the first `count` numbers."""
+    total = 0.0
+    for k in range(count):
+        total += a[k] * b[k]
+    return total
+
+
+@jit
+def invert(matrix: Floats) -> bool:
+    """Invert a positive definite matrix in place (Gauss-Jordan); False where it is none."""
+    n = len(matrix)
+    for k in range(n):
+        pivot = matrix[k, k]
+        if not 1e-9 < pivot < 1e30:
+            return False
+        matrix[k, k] = 1.0
+        for j in range(n):
+            matrix[k, j] /= pivot
+        for i in range(n):
+            if i == k:
+                continue
+            factor = matrix[i, k]
+            matrix[i, k] = 0.0
+            for j in range(n):
+                matrix[i, j] -= factor * matrix[k, j]
+    return True

@@ -1,0 +1,170 @@
+"""Position and diameter of each cap from a paraboloid around its centre; no model of the cap."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from mushpipe import Camera, Circles, DepthSource, InputError, Locations, RgbdFrame, Stage
+from mushpipe.stages.cap_samples import CELLS
+from mushpipe.stages.paraboloid import ASPECT, COEFFICIENTS, SHAPE_M, fit_surfaces
+from mushpipe.stages.upright import pixel_rays
+
+Floats = NDArray[np.float64]
+ASPECT_SIGMA = 0.15
+LIP = 0.25  # what is below the rim's plane, over its radius
+OUTLINE = 0.008  # sigma of a cap's diameter about that of its outline, relative
+WHOLE = 0.85  # share of the grid that finds depth on a cap which nothing hides
+STEEPEST = np.radians(60)
+SLOPE = np.radians(10)  # sigma of the tilt that a slope shows: caps are neither even nor round
+SPREAD = np.radians(15)  # of the tilts in a bed about what they have in common, per direction
+
+
+class SurfaceFit(Stage):
+    """Fits a paraboloid to the depth around each circle's centre: position and diameter with sigma.
+
+    The position is the paraboloid's at the centre, also where depth is missing just there. The
+    diameter is the circle's at the depth of the rim, put right for the tilt that the paraboloid's
+    slope shows. Nearer mushrooms' circles hide what they cover. A mushroom with hardly any depth
+    is ``missing``.
+    """
+
+    depth_noise_mm: float = Field(0.3, ge=0, description="sigma of depth at the camera, mm")
+    depth_noise_per_m: float = Field(1.2, ge=0, description="its growth with depth, mm per m")
+    circle_sigma_px: float = Field(
+        0.5, gt=0, description="sigma of the circles' centres and radii, px"
+    )
+    min_points: int = Field(8, ge=6, le=30, description="fewest points of the grid a fit needs")
+
+    def open(self) -> None:
+        """Compile the kernels."""
+        depth = np.full((48, 64), 0.4, np.float32)
+        camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+        self.fit(depth, camera, np.array([[32.0, 24.0, 9.0]]))
+
+    def process(self, frame: RgbdFrame, circles: Circles) -> Locations:
+        """Return one location per circle.
+
+        Raises:
+            InputError: The frame has depth but no calibration.
+        """
+        if frame.depth is None or not len(circles):
+            return Locations.unknown(len(circles))
+        if frame.camera is None:
+            raise InputError(
+                "depth cannot be turned into metres without the camera's calibration: record "
+                "camera_info, or set source.camera: {fx: , fy: , cx: , cy: }"
+            )
+        depth = np.fmax(frame.depth_m, np.float32(0))  # missing: 0 in place of NaN
+        discs = np.column_stack([circles.center, circles.radius])
+        surface, covariance, seen = self.fit(depth, frame.camera, discs)
+        focal = (frame.camera.fx + frame.camera.fy) / 2
+        pixel = self.circle_sigma_px * surface[:, 0] / focal  # its sigma on the cap, m
+        size = circles.radius * surface[:, 0] / focal
+        slope = surface[:, 1:3] / size[:, None]
+        ray = frame.camera.deproject(circles.center, np.ones(len(circles)))
+        position = ray * surface[:, :1]
+        along = covariance[:, 0, 0] + SHAPE_M**2 + (slope**2).sum(axis=1) * pixel**2
+        diameter, sigma_diameter = diameters(surface, covariance, size, ray)
+        # what is hidden of an outline was guessed by the detector
+        whole = np.minimum(seen / (WHOLE * len(CELLS)), 1) ** 2
+        sigma_diameter = np.hypot(sigma_diameter, 2 * pixel) / np.maximum(whole, 1e-3)
+        known = np.isfinite(position).all(axis=1)
+        return Locations(
+            position=position,
+            distance=np.linalg.norm(position, axis=1),
+            diameter=diameter,
+            source=np.where(known, sources(circles, depth), DepthSource.MISSING),
+            sigma_position=np.column_stack([pixel, pixel, np.sqrt(along)]),
+            sigma_diameter=sigma_diameter,
+        )
+
+    def fit(
+        self, depth: NDArray[np.float32], camera: Camera, discs: Floats
+    ) -> tuple[Floats, Floats, NDArray[np.int64]]:
+        """Return coefficients (N, 6), m, their covariances (N, 6, 6) and numbers of points (N,).
+
+        Args:
+            depth: (H, W) m, 0 = missing, finite.
+            camera: Intrinsics.
+            discs: (N, 3) x, y, radius, px.
+        """
+        n = len(discs)
+        image = (depth, pixel_rays(camera), np.full(depth.shape, n, np.int32))
+        noise = (self.depth_noise_mm / 1000, self.depth_noise_per_m / 1000)
+        surface = np.full((n, COEFFICIENTS), np.nan)
+        covariance = np.full((n, COEFFICIENTS, COEFFICIENTS), np.nan)
+        focal = (camera.fx + camera.fy) / 2
+        seen = fit_surfaces(image, discs, focal, noise, self.min_points, (surface, covariance))
+        return surface, covariance, seen
+
+
+def sources(circles: Circles, depth: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return where the depth at the centres (N,) comes from: from there, or from around it."""
+    u, v = np.rint(circles.center).astype(int).T
+    height, width = depth.shape
+    inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    measured = inside & (depth[v.clip(0, height - 1), u.clip(0, width - 1)] > 0)
+    return np.where(measured, DepthSource.MEASURED, DepthSource.NEIGHBOURS).astype(np.uint8)
+
+
+def diameters(
+    surface: Floats, covariance: Floats, size: Floats, ray: Floats
+) -> tuple[Floats, Floats]:
+    """Return the diameters (N,) m of caps, and their sigmas but for that of the circle.
+
+    A cap of rim radius R and aspect a, seen at an angle t to its axis, has an outline of the
+    half axes R and R (sqrt(c^2 + a^2 s^2) + sqrt(c^2 + l^2 s^2)) / 2 with c = cos t, s = sin t and
+    l that of its underside; off the optical axis by f a pinhole stretches areas by 1 / cos f. The
+    rim is a R deeper than the top, along the axis. Around the top a spheroid's depth grows by
+    a R (x^2 + y^2) / 2, x and y in radii, and its slope is (1 - a^2) of the tilt.
+
+    Args:
+        surface: (N, 6) coefficients of the paraboloid, m.
+        covariance: (N, 6, 6).
+        size: (N,) radius of the circle at the depth of its centre, m.
+        ray: (N, 3) ray of the centre at z = 1.
+    """
+    bend = surface[:, 3] + surface[:, 5]
+    spread = covariance[:, 3, 3] + covariance[:, 5, 5] + 2 * covariance[:, 3, 5]
+    prior = (ASPECT_SIGMA * size) ** 2
+    aspect = (bend * prior + ASPECT * size * spread) / (spread + prior) / size
+    aspect = np.clip(aspect, 0.25, 1)
+    length = np.linalg.norm(ray, axis=1)
+    view = -ray / length[:, None]
+    slope = surface[:, 1:3] / size[:, None]
+    normal = np.insert(slope, 2, -1.0, axis=1)
+    steeper = 1 / np.maximum(1 - aspect**2, 0.35)
+    seen = steeper[:, None] * _lean(normal, view)
+    noise = steeper * np.sqrt((covariance[:, 1, 1] + covariance[:, 2, 2]) / 2) / size
+    fitted = np.isfinite(noise)
+    # what the caps of a bed have in common
+    upright = np.median((view + seen)[fitted], axis=0) if fitted.any() else np.full(3, np.nan)
+    known, common = noise**2 + SLOPE**2, _lean(np.tile(upright, (len(view), 1)), view)
+    share = (SPREAD**2 / (SPREAD**2 + known))[:, None]
+    variance = share[:, 0] * known
+    tilt = np.sqrt(((share * seen + (1 - share) * common) ** 2).sum(axis=1) + variance)
+    tilt = np.minimum(tilt, STEEPEST)
+    sigma = np.sqrt(variance)
+
+    depth = 1 + aspect * size * np.cos(tilt) / surface[:, 0]
+    narrowed = _narrowed(tilt, aspect)
+    diameter = 2 * size * depth / narrowed / np.sqrt(length)
+    leaning = _narrowed(tilt + sigma, aspect) / narrowed - 1
+    return diameter, diameter * np.hypot(OUTLINE, leaning)
+
+
+def _lean(vectors: Floats, view: Floats) -> Floats:
+    """Return how vectors lean off unit vectors: perpendicular to these, as long as the angle."""
+    along = (vectors * view).sum(axis=1, keepdims=True)
+    across = vectors - along * view
+    length = np.linalg.norm(across, axis=1, keepdims=True)
+    return np.asarray(across * np.arctan2(length, along) / np.maximum(length, 1e-9))
+
+
+def _narrowed(tilt: Floats, aspect: Floats) -> Floats:
+    """Return the radius of the circle of a tilted cap's area over that of its rim."""
+    c2, s2 = np.cos(tilt) ** 2, np.sin(tilt) ** 2
+    short = (np.sqrt(c2 + aspect**2 * s2) + np.sqrt(c2 + LIP**2 * s2)) / 2
+    return np.asarray(np.sqrt(short))

@@ -1,0 +1,65 @@
+"""What stands around a mushroom: what hides it, and how much room there is."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
+
+from mushpipe.core.jit import jit
+from mushpipe.core.tables import Circles, Floats, Locations
+from mushpipe.stages.cap_samples import paint
+
+
+def hidden_share(circles: Circles, distance: Floats, image: tuple[int, int]) -> Floats:
+    """Return which share (N,) of each circle lies behind circles of nearer mushrooms.
+
+    Args:
+        circles: Outlines, px.
+        distance: (N,) m; a mushroom without hides nothing and is hidden by all that it overlaps.
+        image: Width and height, px; what lies outside does not count.
+    """
+    n = len(circles)
+    order = np.argsort(np.nan_to_num(distance, nan=np.inf), kind="stable")
+    rank = np.empty(n, np.int64)
+    rank[order] = np.arange(n)
+    discs = np.column_stack([circles.center, circles.radius])
+    ranks = np.full(image[::-1], n, np.int32)
+    paint(ranks, discs, order)
+    return covered(ranks, discs, rank)
+
+
+@jit
+def covered(ranks: NDArray[np.int32], discs: Floats, rank: NDArray[np.int64]) -> Floats:
+    """Return the share (N,) of each disc's pixels that bear a lower rank than its own.
+
+    Args:
+        ranks: (H, W) rank of the nearest disc on each pixel.
+        discs: (N, 3) x, y, radius, px.
+        rank: (N,) of the discs.
+    """
+    height, width = ranks.shape
+    shares = np.zeros(len(discs))
+    for i in range(len(discs)):
+        x, y, r = discs[i]
+        total, lower = 0, 0
+        for v in range(max(0, int(np.ceil(y - r))), min(height, int(np.floor(y + r)) + 1)):
+            for u in range(max(0, int(np.ceil(x - r))), min(width, int(np.floor(x + r)) + 1)):
+                if (u - x) ** 2 + (v - y) ** 2 <= r * r:
+                    total += 1
+                    lower += ranks[v, u] < rank[i]
+        shares[i] = lower / max(total, 1)
+    return shares
+
+
+def clearance(locations: Locations) -> Floats:
+    """Return the gap (N,) m between each cap's outline and the nearest other one, from above.
+
+    Caps overlap where it is negative. Infinite for a mushroom alone; NaN where its position or
+    diameter is unknown, and such a neighbour does not count.
+    """
+    radius, place = locations.diameter / 2, locations.position[:, :2]
+    gaps = cdist(place, place) - radius[:, None] - radius[None]
+    np.fill_diagonal(gaps, np.inf)
+    gap = np.fmin.reduce(gaps, axis=1, initial=np.inf)
+    return np.where(np.isfinite(radius + place[:, 0]), gap, np.nan)

@@ -1,0 +1,55 @@
+"""Transforms as settings: written out in a graph, or in a file of their own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from mushpipe.core.document import parse_document
+from mushpipe.core.errors import GraphError
+from mushpipe.core.graph import compile_document
+from mushpipe.core.plugins import load_registry
+from mushpipe.core.transform import Transform
+
+GRAPH = """
+mushpipe: 1
+source: {{use: synthetic}}
+stages:
+  segment: {{use: otsu}}
+  detect: {{use: hough}}
+  locate: {{use: nearest-depth}}
+  pick: {{use: picks, T_base_camera: {}}}
+"""
+INLINE = "{frame: base, translation: [0.1, 0, 1], quaternion: [1, 0, 0, 0]}"
+
+
+def setting(folder: Path, text: str) -> object:
+    document = parse_document(GRAPH.format(text), str(folder / "g.yaml"), folder)
+    plan = compile_document(document, load_registry())
+    return plan.stages[-1].plugin.T_base_camera  # type: ignore[attr-defined]
+
+
+def test_a_file_means_the_same_as_its_content(tmp_path: Path) -> None:
+    (tmp_path / "camera.yaml").write_text(
+        "frame: base\ntranslation: [0.1, 0, 1]\nquaternion: [1, 0, 0, 0]\n"
+    )
+    written = Transform(frame="base", translation=(0.1, 0, 1), quaternion=(1, 0, 0, 0))
+    assert setting(tmp_path, "camera.yaml") == setting(tmp_path, INLINE) == written
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (INLINE.replace("[1, 0, 0, 0]", "[1, 0, 0, 1]"), "must have length 1"),
+        (INLINE.replace("frame", "fame"), "unknown setting 'fame'"),
+        ("missing.yaml", "missing.yaml: there is no such file"),
+        ("bad.yaml", "expected frame, translation"),
+    ],
+)
+def test_faults_are_reported_where_they_stand(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "bad.yaml").write_text("frame: base\ntranslation: [1, 2]\n")
+    with pytest.raises(GraphError, match=r"T_base_camera|fame") as caught:
+        setting(tmp_path, text)
+    assert message in str(caught.value)
+    assert "g.yaml:8:" in str(caught.value)

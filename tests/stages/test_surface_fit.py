@@ -1,0 +1,116 @@
+"""Against spheroids drawn by a ray caster of their own, and closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mushpipe import Camera, Circles, DepthSource, InputError, Locations, RgbdFrame
+from mushpipe.stages.paraboloid import invert
+from mushpipe.stages.surface_fit import SurfaceFit
+from tests.stages.caps import CAMERA, Cap, cap, circles_of, draw, frame_from
+
+BED = 0.5
+GRAY = np.zeros((CAMERA.height, CAMERA.width))
+TILTS = (0, 10, 20, 30)
+CAPS = [
+    cap(tilt, 50.0 * i, (-0.11 + 0.073 * i, 0.0, 0.48), 0.022, 0.6) for i, tilt in enumerate(TILTS)
+]
+
+
+def locate(depth: np.ndarray, circles: Circles, camera: Camera | None = CAMERA) -> Locations:
+    return SurfaceFit().process(frame_from(depth, GRAY, camera), circles)
+
+
+def surface_z(caps: list[Cap], circles: Circles) -> np.ndarray:
+    """Depth of a cap at the pixel next to each centre, from a picture without noise."""
+    depth, _ = draw(caps, BED)
+    u, v = np.rint(circles.center).astype(int).T
+    return depth[v, u]
+
+
+def test_position_and_diameter_of_tilted_spheroids() -> None:
+    circles = circles_of(CAPS)
+    found = locate(draw(CAPS, BED)[0], circles)
+    assert found.position[:, 2] == pytest.approx(surface_z(CAPS, circles), abs=4e-4)
+    assert found.diameter == pytest.approx(2 * 0.022, abs=0.0015)
+    assert found.source.tolist() == [DepthSource.MEASURED] * 4
+    projected = CAMERA.project(found.position)
+    np.testing.assert_allclose(projected, circles.center, atol=1e-6)
+    assert found.distance == pytest.approx(np.linalg.norm(found.position, axis=1))
+
+
+def test_a_hole_at_the_centre_moves_nothing_and_is_said() -> None:
+    circles, depth = circles_of(CAPS), draw(CAPS, BED)[0]
+    whole = locate(depth, circles)
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    for (x, y), r in zip(circles.center, circles.radius, strict=True):
+        depth[(u - x) ** 2 + (v - y) ** 2 < (0.25 * r) ** 2] = np.nan
+    found = locate(depth, circles)
+    assert found.source.tolist() == [DepthSource.NEIGHBOURS] * 4
+    assert found.position[:, 2] == pytest.approx(whole.position[:, 2], abs=2e-4)
+    assert (found.sigma_position[:, 2] > whole.sigma_position[:, 2]).all()
+
+
+def test_depth_on_the_soil_alone_is_missing_never_a_number() -> None:
+    circles, depth = circles_of(CAPS), draw(CAPS, BED)[0]
+    for gone in (depth < BED, np.ones_like(depth, bool)):
+        found = locate(np.where(gone, np.nan, depth), circles)
+        assert found.source.tolist() == [DepthSource.MISSING] * 4
+        for values in (found.position, found.distance, found.diameter):
+            assert np.isnan(values).all()
+
+
+def test_no_depth_no_circles_no_calibration() -> None:
+    circles = circles_of(CAPS[:1])
+    color = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
+    frame = RgbdFrame(frame_from(GRAY + 1, GRAY).header, color, None, 1.0, CAMERA)
+    assert SurfaceFit().process(frame, circles).source.tolist() == [DepthSource.MISSING]
+    assert len(locate(GRAY + 0.5, circles.take(np.array([], int)))) == 0
+    with pytest.raises(InputError, match="without the camera's calibration"):
+        locate(GRAY + 0.5, circles, None)
+
+
+def test_a_nearer_cap_is_not_taken_for_the_one_it_hides() -> None:
+    below = cap(0, 0, (0.0, 0.0, 0.48), 0.025, 0.6)
+    above = cap(0, 0, (0.024, 0.0, 0.45), 0.02, 0.6)
+    circles = circles_of([below, above])
+    found = locate(draw([below, above], BED)[0], circles)
+    alone = locate(draw([below], BED)[0], circles.take(np.array([0])))
+    assert found.position[0, 2] == pytest.approx(alone.position[0, 2], abs=5e-4)
+    assert found.sigma_diameter[0] > 1.2 * alone.sigma_diameter[0]
+
+
+def test_noise_stays_below_the_stated_sigma_and_moves_nothing() -> None:
+    circles, depth = circles_of(CAPS), draw(CAPS, BED)[0]
+    clean, rng = locate(depth, circles), np.random.default_rng(0)
+    sigma = 0.0003 + 0.0012 * depth
+    noisy = [locate(depth + rng.normal(0, sigma), circles) for _ in range(30)]
+    spread = np.std([found.position[:, 2] for found in noisy], axis=0)
+    bias = np.mean([found.position[:, 2] for found in noisy], axis=0) - clean.position[:, 2]
+    # the stated one also holds the shape, and noise that neighbours share
+    assert (spread < noisy[0].sigma_position[:, 2]).all()
+    assert np.abs(bias).max() < 1e-4
+
+
+def test_a_distorted_camera_changes_nothing() -> None:
+    lens = (0.1, -0.2, 0.002, -0.001, 0.05)
+    bent = Camera(320, 240, 400.0, 400.0, 159.5, 119.5, "brown_conrady", lens)
+    circles = circles_of(CAPS, bent)
+    found = locate(draw(CAPS, BED, bent)[0], circles, bent)
+    straight = locate(draw(CAPS, BED)[0], circles_of(CAPS))
+    np.testing.assert_allclose(found.position, straight.position, atol=5e-4)
+    np.testing.assert_allclose(found.diameter, straight.diameter, rtol=0.04)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10**6), st.integers(1, 6))
+def test_the_inverse_is_numpys(seed: int, n: int) -> None:
+    rows = np.random.default_rng(seed).normal(size=(n + 3, n))
+    matrix = rows.T @ rows + 0.1 * np.eye(n)
+    own = matrix.copy()
+    assert invert(own)
+    np.testing.assert_allclose(own, np.linalg.inv(matrix), rtol=1e-7, atol=1e-9)
+    assert not invert(np.zeros((n, n)))

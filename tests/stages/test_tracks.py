@@ -1,0 +1,101 @@
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mushpipe import Circles, DepthSource, Locations
+from mushpipe.stages.tracks import Tracks
+from tests.stages.scenes import CAMERA
+
+IMAGE = (CAMERA.width, CAMERA.height)
+
+
+def seen(*rows: tuple[float, float, float], radius: float = 8.0) -> tuple[Circles, Locations]:
+    """Mushrooms at u, v (px) and z (m); a z of NaN is missing."""
+    u, v, z = np.reshape(rows, (len(rows), 3)).T
+    center, n = np.stack([u, v], axis=1), len(u)
+    position = CAMERA.deproject(center, z)
+    missing = np.isnan(z)
+    position[missing] = np.nan
+    return Circles(center, np.full(n, radius), np.ones(n)), Locations.unknown(
+        n,
+        position=position,
+        distance=np.linalg.norm(position, axis=1),
+        diameter=2 * radius * z / CAMERA.fx,
+        source=np.where(missing, DepthSource.MISSING, DepthSource.MEASURED),
+    )
+
+
+def ids(tracks: Tracks, *rows: tuple[float, float, float], at: int = 0) -> list[int]:
+    return tracks.update(*seen(*rows), IMAGE, at, 10).tolist()
+
+
+flat = st.lists(
+    st.tuples(st.integers(0, 7), st.integers(0, 5)), min_size=6, max_size=20, unique=True
+)
+
+
+@given(
+    st.randoms(),
+    flat,
+    st.tuples(st.floats(-25, 25), st.floats(-25, 25)),
+    st.sampled_from([0.5, np.nan]),
+)
+def test_ids_follow_a_bed_that_shifts_whatever_the_order(
+    rng: object, cells: list[tuple[int, int]], shift: tuple[float, float], z: float
+) -> None:
+    """Mushrooms 20 px apart on average; the whole bed shifts by up to more than that."""
+    jitter = np.random.default_rng(len(cells)).uniform(-6, 6, (len(cells), 2))
+    places = [(20.0 * x + j, 20.0 * y + k, z) for (x, y), (j, k) in zip(cells, jitter, strict=True)]
+    tracks = Tracks()
+    first = ids(tracks, *places)
+    order = list(range(len(places)))
+    rng.shuffle(order)  # type: ignore[attr-defined]
+    moved = [(places[i][0] + shift[0], places[i][1] + shift[1], z) for i in order]
+    assert ids(tracks, *moved, at=1) == [first[i] for i in order]
+
+
+def test_ids_follow_a_moving_camera_though_some_leave_and_some_come() -> None:
+    rng = np.random.default_rng(0)
+    bed = np.column_stack([rng.uniform(0, 400, 90), rng.uniform(10, 110, 90)])
+    bed = bed[[all(np.hypot(*(p - q)) > 14 for q in bed[:i]) for i, p in enumerate(bed)]]
+    z = rng.uniform(0.46, 0.5, len(bed))
+    tracks, names = Tracks(), {}
+    for step in range(10):
+        u = bed[:, 0] - 21.0 * step * 0.48 / z
+        view = np.flatnonzero((u > 0) & (u < IMAGE[0]) & (rng.random(len(bed)) > 0.1))
+        rows = np.column_stack([u, bed[:, 1], z])[view] + rng.normal(0, [0.5, 0.5, 0.001])
+        for mushroom, name in zip(view, ids(tracks, *map(tuple, rows), at=step), strict=True):
+            assert names.setdefault(mushroom, name) == name
+    assert len(names) == len(set(names.values())) > 30
+
+
+def test_a_nearer_mushroom_is_not_the_one_behind_it() -> None:
+    tracks = Tracks()
+    assert ids(tracks, (50, 50, 0.50)) == [0]
+    assert ids(tracks, (50, 50, 0.46), at=1) == [1]
+    assert ids(tracks, (50, 50, np.nan), at=2) in ([0], [1])
+
+
+def test_an_id_survives_a_gap_within_the_memory_and_is_never_used_again() -> None:
+    here, elsewhere = (50, 50, 0.5), (90, 90, 0.5)
+    tracks = Tracks()
+    assert ids(tracks, here) == [0]
+    assert ids(tracks, elsewhere, at=5) == [1]
+    assert ids(tracks, here, at=10) == [0]
+    assert ids(tracks, at=21) == []
+    assert ids(tracks, here, at=40) == [2]
+
+
+def test_a_jump_of_more_than_half_a_radius_is_another_mushroom() -> None:
+    tracks = Tracks()
+    ids(tracks, (50, 50, 0.5))
+    assert ids(tracks, (54.1, 50, 0.5), at=1) == [1]
+
+
+def test_one_that_moves_alone_does_not_move_the_others() -> None:
+    tracks = Tracks()
+    places = [(20.0, 30.0, 0.5), (60.0, 30.0, 0.5), (100.0, 30.0, 0.5), (140.0, 30.0, 0.5)]
+    ids(tracks, *places)
+    assert ids(tracks, (30.0, 30.0, 0.5), *places[1:], at=1) == [4, 1, 2, 3]
