@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from pose_scenes import SETS, circles_in, frames, truth_of
+from pose_scenes import SETS, detected, frames, true_circles, truth_of
 
 from mushpipe import Circles, Locations, Poses, RgbdFrame
 from mushpipe.stages.cap_fit import CapFit
@@ -33,6 +33,7 @@ FLOOR = {
     "depth_noise_per_m": 0,
     "circle_sigma_px": 0.3,
 }
+SLOW = ("registration", "ICP")
 Method = Callable[[list[RgbdFrame], Circles], tuple[Locations, Poses]]
 
 
@@ -92,9 +93,9 @@ class Tally:
         self.missing = 0
 
     def add(self, locations: Locations, poses: Poses, frame: RgbdFrame, rows: np.ndarray) -> None:
-        """Take in one frame; `rows` are the truth's rows of the circles."""
+        """Take in one frame; `rows` are the truth's rows of the circles, -1 for none."""
         truth = truth_of(frame)
-        counts = truth.ignore[rows] == 0
+        counts = (rows >= 0) & (truth.ignore[rows] == 0)
         self.missing += int((counts & ~poses.valid).sum())
         k, t = np.flatnonzero(counts & poses.valid), rows[counts & poses.valid]
         cosine = np.clip((poses.axis[k] * truth.axis[t]).sum(axis=1), -1, 1)
@@ -141,7 +142,6 @@ def main() -> None:
     parser.add_argument("--family", choices=["a", "b"], default="a")
     parser.add_argument("--seeds", default="11:14", help="first:past the last")
     parser.add_argument("--sets", default="paper,bed,hard,upright,crowded")
-    parser.add_argument("--exact-circles", action="store_true")
     parser.add_argument("--cache", type=Path, help="folder that keeps rendered frames")
     parser.add_argument("--registration", type=int, default=1, help="seeds it is run on (slow)")
     options = parser.parse_args()
@@ -154,6 +154,9 @@ def main() -> None:
         "towards the camera": trivial("camera"),
         "registration": registered(),
         "registration, cap": registered(model="cap"),
+        "ICP from upright, cap": registered(
+            **{"model": "cap", "global": "none", "local": "point-to-plane"}
+        ),
     }
     print(HEAD)
     for name in options.sets.split(","):
@@ -161,13 +164,16 @@ def main() -> None:
         for seed in range(first, last):
             for scene in SETS[name]:
                 taken = frames(scene, seed, options.family, 5, options.cache)
-                circles, rows = circles_in(truth_of(taken[0]), seed, options.exact_circles)
+                circles, rows = detected(taken[0])
                 for method, run in methods.items():
-                    if method.startswith("registration") and seed - first >= options.registration:
+                    if (
+                        method.startswith(("registration", "ICP"))
+                        and seed - first >= options.registration
+                    ):
                         continue
                     if method.startswith("floor"):
                         clean = frames(scene, seed, options.family, 1, options.cache, sensor=EXACT)
-                        true, same = circles_in(truth_of(clean[0]), seed, True)
+                        true, same = true_circles(clean[0])
                         tallies[method].add(*run(clean, true), clean[0], same)
                     else:
                         tallies[method].add(*run(taken, circles), taken[0], rows)

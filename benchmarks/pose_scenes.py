@@ -1,10 +1,11 @@
-"""Simulated scenes to measure pose and location on, and circles as a detector finds them."""
+"""Simulated scenes to measure pose and location on, and the circles found in them."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import pickle
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,13 @@ import numpy as np
 
 from mushpipe import Circles, RgbdFrame
 from mushpipe.core.truth import TRUTH_TOPIC, Ignore, Truth
+from mushpipe.evaluate.matching import match
+from mushpipe.evaluate.truth import FrameTruth
 from mushpipe.sources.synthetic import SyntheticSource
+from mushpipe.stages.chan_vese import ChanVese
+from mushpipe.stages.flatten import Flatten
+from mushpipe.stages.opening import Opening
+from mushpipe.stages.phase_hough import PhaseHough
 
 _HARD = {"size_mm": (20, 60), "tilt_deg": (0, 45), "cluster": 0.4}
 # name -> scenes that are pooled
@@ -55,17 +62,27 @@ def truth_of(frame: RgbdFrame) -> Truth:
     return truth
 
 
-def circles_in(truth: Truth, seed: int, exact: bool) -> tuple[Circles, np.ndarray]:
-    """Return circles of all visible caps, and the rows of the truth they are.
+@lru_cache
+def detector() -> tuple[Flatten, ChanVese, Opening, PhaseHough]:
+    """Return the stages of `graphs/pick.yaml` that find circles, for caps of any size."""
+    stages = Flatten(), ChanVese(channel="auto"), Opening(size=10), PhaseHough(radius_px=None)
+    for stage in stages:
+        stage.open()
+    return stages
 
-    As a detector finds them: centres 1 to 2 px off in any direction, radii up to 1.5 px.
-    """
+
+def detected(frame: RgbdFrame) -> tuple[Circles, np.ndarray]:
+    """Return the circles a detector finds, and for each the row of its mushroom, -1 for none."""
+    flatten, segment, opening, detect = detector()
+    circles = detect.process(frame, opening.process(segment.process(flatten.process(frame))))
+    rows = np.full(len(circles), -1)
+    matching = match(FrameTruth(truth_of(frame)), circles.center, circles.radius)
+    rows[matching.found] = matching.truth
+    return circles, rows
+
+
+def true_circles(frame: RgbdFrame) -> tuple[Circles, np.ndarray]:
+    """Return the true circles of all visible caps, and the rows of the truth they are."""
+    truth = truth_of(frame)
     rows = np.flatnonzero((truth.visible > 0.3) & (truth.radius > 7) & np.isin(truth.ignore, SEEN))
-    rng = np.random.default_rng(seed)
-    n = len(rows)
-    turn, off = rng.uniform(0, 2 * np.pi, n), rng.uniform(1, 2, n)
-    shift = off[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    grow = rng.uniform(-1.5, 1.5, n)
-    if exact:
-        shift, grow = np.zeros_like(shift), np.zeros_like(grow)
-    return Circles(truth.center[rows] + shift, truth.radius[rows] + grow, np.ones(n)), rows
+    return Circles(truth.center[rows], truth.radius[rows], np.ones(len(rows))), rows

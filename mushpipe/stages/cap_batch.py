@@ -12,27 +12,32 @@ from mushpipe.core.jit import jit
 from mushpipe.stages.cap_model import (
     HEIGHT,
     RADIUS,
+    ROOM,
     SIZE,
     UNKNOWNS,
     Floats,
     N,
+    Singles,
     Vector,
     frozen,
     meet,
     slope,
 )
+from mushpipe.stages.cap_order import rank_by_depth
 from mushpipe.stages.cap_outline import sample_outline
 from mushpipe.stages.cap_samples import (
     CELLS,
     COMPASS,
     DIRECTIONS,
-    paint,
     ray_at,
     sample_depth,
     sample_edges,
+    touch,
 )
-from mushpipe.stages.cap_solve import ROUND, Noise, refine, tilt, uncertainty, workspace
+from mushpipe.stages.cap_solve import ROUND, Noise, invert, refine, tilt, workspace
 from mushpipe.stages.cap_start import spread_of, start
+
+ROUNDNESS = 0.015  # in rim radii: how far the rim of a cap is from the circle of its area
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +59,7 @@ class Fits:
         fitness: (N,) 0..1, mean robust weight of the points of the grid, 0 for a missing one.
         edges: (N,) number of rays along the depth edge.
         lines: (N,) number of rays along the outline in colour.
+        misfit: (N,) mean squared residual, in sigmas.
     """
 
     valid: NDArray[np.bool_]
@@ -70,39 +76,7 @@ class Fits:
     fitness: Floats
     edges: NDArray[np.int64]
     lines: NDArray[np.int64]
-
-
-@jit
-def core_depth(depth: NDArray[np.float32], circle: Floats) -> float:
-    """Return the median depth (m) near the centre of a circle (x, y, r), 0 without any."""
-    values = np.empty(81)
-    n = 0
-    for i in range(-4, 5):
-        for j in range(-4, 5):
-            u = int(np.floor(circle[0] + 0.12 * i * circle[2] + 0.5))
-            v = int(np.floor(circle[1] + 0.12 * j * circle[2] + 0.5))
-            if 0 <= v < depth.shape[0] and 0 <= u < depth.shape[1] and depth[v, u] > 0:
-                values[n] = depth[v, u]
-                n += 1
-    return float(np.median(values[:n])) if n else 0.0
-
-
-@jit
-def rank_by_depth(
-    depth: NDArray[np.float32], circles: Floats, ranks: NDArray[np.int32]
-) -> NDArray[np.int64]:
-    """Return each circle's rank (N,), the nearest 0, and paint them over a `ranks` full of N."""
-    far = np.empty(len(circles))
-    for i in range(len(circles)):
-        far[i] = core_depth(depth, circles[i])
-        if far[i] <= 0.0:
-            far[i] = 1e30  # hides nothing
-    order = np.argsort(far)
-    paint(ranks, circles, order)
-    rank = np.empty(len(circles), np.int64)
-    for k in range(len(circles)):
-        rank[order[k]] = k
-    return rank
+    misfit: Floats
 
 
 @jit
@@ -112,72 +86,72 @@ def gather(
     rank: int,
     focal: float,
     sensor: tuple[float, float, float, float],
-    data: Any,
+    rays: Singles,
 ) -> tuple[int, int, float]:
-    """Take the data of a cap; return numbers of points and edge rays, and its middle depth (m)."""
-    points, edges, around = data
-    n, middle = sample_depth(image, rank, circle, focal, (sensor[0], sensor[1]), points)
+    """Take the rays of a cap; return numbers of points and edge rays, and its middle depth (m)."""
+    n, middle = sample_depth(image, rank, circle, focal, (sensor[0], sensor[1]), rays[:, ROUND:])
     if n == 0:
         return 0, 0, 0.0
-    m = sample_edges(image, rank, circle, focal, middle, sensor[3], edges)
-    for j in range(n):
-        points[3, j] -= sensor[2] / points[2, j]
+    for j in range(ROUND, ROUND + n):
+        rays[3, j] -= sensor[2] / rays[2, j]
+    m = sample_edges(image, rank, circle, focal, middle, sensor[3], rays[:, ROUND + n :])
     for j in range(ROUND):
         turn = COMPASS[j * (DIRECTIONS // ROUND)]
         x, y = circle[0] + circle[2] * turn[0], circle[1] + circle[2] * turn[1]
-        around[0, j], around[1, j], around[2, j] = ray_at(image[1], focal, x, y)
+        touch(rays, j, ray_at(image[1], focal, x, y), 0.0, 0.0)
     return n, m, middle - sensor[2]
 
 
 @jit
 def first_fits(
-    frame: Any, circles: Floats, upright: tuple[Floats, float], settings: Any, data: Any, out: Any
-) -> None:
-    """Gather the data of every cap, and fit it with the same prior for all.
+    frame: Any, circles: Floats, upright: tuple[Floats, float], settings: Any, rays: Singles,
+    out: Any,
+) -> None:  # fmt: skip
+    """Gather the rays of every cap, and fit it with the same prior for all.
 
     Args:
         frame: Luma (H, W), image (see `sample_depth`) and focal length, px.
         circles: (N, 3) x, y, radius, px.
         upright: Unit vector (3,) and spread of tilts, rad.
-        settings: `Noise`; sigma of depth (2), bias (m) and edge offset (px); fewest points.
-        data: Per cap room for points, edges, rays around the circle and along the outline.
+        settings: `Noise`; sigma of depth (2), bias (m) and edge offset (px); sigma of the outline
+            in colour, px; fewest points.
+        rays: (N, 6, ROOM) room for those of each cap.
         out: Per cap parameters, covariance, surface point with sigmas, and counts of points, edge
-            rays, outline rays, weight; and size, m. A cap without a fit keeps a count of 0.
+            rays, outline rays, weight; size, m; and misfit. A cap without a fit keeps a count of 0.
     """
     gray, image, focal = frame
-    noise, sensor, least = settings
-    points, edges, around, outline = data
+    noise, sensor, outline_px, least = settings
     caps, covariances, _, counts = out
     rank, work = rank_by_depth(image[0], circles, image[2]), workspace()
     for i in range(len(circles)):
-        room = (points[i], edges[i], around[i])
-        n, m, middle = gather(image, circles[i], rank[i], focal, sensor, room)
+        circle, seen = circles[i], rays[i]
+        n, m, middle = gather(image, circle, rank[i], focal, sensor, seen)
         if n < least or middle <= 0.0:
             continue
-        size = circles[i, 2] * middle / focal
-        ray = ray_at(image[1], focal, circles[i, 0], circles[i, 1])
-        start(caps[i], points[i], n, upright[0], ray, middle, size)
-        known = (points[i][:, :n], edges[i][:, :m], around[i], outline[i][:, :0])
-        if not refine(caps[i], known, upright, noise, focal, size, 0, 2, work):
+        size = circle[2] * middle / focal
+        ray = ray_at(image[1], focal, circle[0], circle[1])
+        start(caps[i], seen[:, ROUND:], n, upright[0], ray, middle, size)
+        setting, count = (noise, 1.0 / focal, size), ROUND + n + m
+        if refine(caps[i], seen, count, upright, setting, (0, 2), work)[0] < 0.0:
             continue
         lines = sample_outline(
-            gray, image[1], image[2], rank[i], caps[i], circles[i], focal, outline[i]
-        )
-        known = (points[i][:, :n], edges[i][:, :m], around[i], outline[i][:, :lines])
-        if not refine(caps[i], known, upright, noise, focal, size, 2, 4, work):
+            gray, image[1], image[2], rank[i], caps[i], circle, focal, outline_px, work[1],
+            seen[:, count:],
+        )  # fmt: skip
+        if refine(caps[i], seen, count + lines, upright, setting, (2, 4), work)[0] < 0.0:
             continue
-        if uncertainty(caps[i], known, upright, noise, focal, covariances[i], work) >= 0.0:
-            counts[i, 0], counts[i, 1], counts[i, 2], counts[i, 4] = n, m, lines, size
+        invert(work[0][0], covariances[i])
+        counts[i, 0], counts[i, 1], counts[i, 2], counts[i, 4] = n, m, lines, size
 
 
 @jit
 def second_fits(
-    frame: Any, circles: Floats, upright: tuple[Floats, float], settings: Any, data: Any, out: Any
-) -> None:
+    frame: Any, circles: Floats, upright: tuple[Floats, float], settings: Any, rays: Singles,
+    out: Any,
+) -> None:  # fmt: skip
     """Refine every fit with what the scene says of its caps' tilt; arguments as `first_fits`."""
     _, image, focal = frame
     noise = settings[0]
-    points, edges, around, outline = data
     caps, covariances, surfaces, counts = out
     squares, variances = np.full(len(caps), -1.0), np.ones(len(caps))
     for i in range(len(caps)):
@@ -190,11 +164,11 @@ def second_fits(
     for i in range(len(caps)):
         if counts[i, 0] == 0:
             continue
-        n, m, lines = int(counts[i, 0]), int(counts[i, 1]), int(counts[i, 2])
-        known = (points[i][:, :n], edges[i][:, :m], around[i], outline[i][:, :lines])
+        count = ROUND + int(counts[i, 0] + counts[i, 1] + counts[i, 2])
+        setting = (noise, 1.0 / focal, counts[i, 4])
         own = (upright[0], spreads[i])
-        refine(caps[i], known, own, noise, focal, counts[i, 4], 4, 5, work)
-        counts[i, 3] = uncertainty(caps[i], known, own, noise, focal, covariances[i], work)
+        counts[i, 3], counts[i, 5] = refine(caps[i], rays[i], count, own, setting, (4, 5), work)
+        invert(work[0][0], covariances[i])
         ray = ray_at(image[1], focal, circles[i, 0], circles[i, 1])
         locate(caps[i], ray, covariances[i], noise.circle_px / focal, surfaces[i])
 
@@ -232,7 +206,7 @@ def fit_caps(
     frame: tuple[NDArray[np.float32], tuple[NDArray[np.float32], NDArray[np.float32]], float],
     circles: Floats,
     upright: tuple[Floats, float],
-    settings: tuple[Noise, tuple[float, float, float, float], int],
+    settings: tuple[Noise, tuple[float, float, float, float], float, int],
 ) -> Fits:
     """Fit a cap to the depth in each circle.
 
@@ -242,8 +216,8 @@ def fit_caps(
         circles: (N, 3) x, y, radius, px.
         upright: Unit vector (3,) and the spread of tilts off it per direction, rad.
         settings: Standard deviations of the model; of the sensor: sigma of depth at the camera (m)
-            and its growth (m per m), bias (m), and how much of an edge it loses (px); the fewest
-            points that make a fit.
+            and its growth (m per m), bias (m), and how much of an edge it loses (px); sigma of the
+            outline in colour, px; the fewest points that make a fit.
     """
     n = len(circles)
     gray, image, focal = frame
@@ -251,17 +225,12 @@ def fit_caps(
         np.full((n, SIZE), np.nan),
         np.full((n, UNKNOWNS, UNKNOWNS), np.nan),
         np.full((n, 6), np.nan),
-        np.zeros((n, 5)),
+        np.zeros((n, 6)),
     )
-    data = (
-        np.empty((n, 5, len(CELLS))),
-        np.empty((n, 3, DIRECTIONS)),
-        np.empty((n, 3, ROUND)),
-        np.empty((n, 3, DIRECTIONS)),
-    )
-    ranked = (gray, (*image, np.full(image[0].shape, n, np.int32)), focal)
-    first_fits(ranked, circles, upright, settings, data, out)
-    second_fits(ranked, circles, upright, settings, data, out)
+    rays = np.empty((n, 6, ROOM), np.float32)
+    ranked = (gray, (*image, np.full(image[0].shape, n, np.int16)), focal)
+    first_fits(ranked, circles, upright, settings, rays, out)
+    second_fits(ranked, circles, upright, settings, rays, out)
     return _fits(*out)
 
 
@@ -282,9 +251,10 @@ def _fits(caps: Floats, covariances: Floats, surfaces: Floats, counts: Floats) -
         surfaces[:, :3],
         covariances,
         np.sqrt(diagonal[:, 3] + diagonal[:, 4]),
-        np.sqrt(diagonal[:, 5]),
+        np.sqrt(diagonal[:, 5] + (ROUNDNESS * caps[:, RADIUS]) ** 2),
         surfaces[:, 3:],
         np.where(valid, np.minimum(counts[:, 3] / len(CELLS), 1.0), np.nan),
         counts[:, 1].astype(np.int64),
         counts[:, 2].astype(np.int64),
+        counts[:, 5],
     )

@@ -43,9 +43,9 @@ class CapFit(Stage):
     depth_noise_mm: float = Field(0.3, ge=0, description="sigma of depth at the camera, mm")
     depth_noise_per_m: float = Field(1.2, ge=0, description="its growth with depth, mm per m")
     edge_offset_px: float = Field(
-        0.45, ge=-3, le=3, description="how much of a cap's edge the depth camera loses, px"
+        0.7, ge=-3, le=3, description="how much of a cap's edge the depth camera loses, px"
     )
-    circle_sigma_px: float = Field(2, gt=0, description="sigma of the circles, px")
+    circle_sigma_px: float = Field(1, gt=0, description="sigma of the circles, px")
     outline_sigma_px: float = Field(
         1, gt=0, description="sigma of the outline in the colour image, alignment included, px"
     )
@@ -95,17 +95,15 @@ class CapFit(Stage):
         """
         rays = pixel_rays(camera)
         noise = Noise(
-            shape=0.0006,
+            shape=0.027,
             outline=0.03,
             circle_px=self.circle_sigma_px,
-            edge_px=2.0,
-            color_px=self.outline_sigma_px,
-            edge_weight=0.6,
-            color_weight=0.6,
             aspect=0.62,
             aspect_sigma=0.2,
             bulge=0.0,
-            bulge_sigma=0.06,
+            bulge_sigma=0.08,
+            firm=15.0,
+            usual=0.25,
         )
         sensor = (
             self.depth_noise_mm / 1000,
@@ -117,7 +115,7 @@ class CapFit(Stage):
             (gray, (depth, rays), (camera.fx + camera.fy) / 2),
             np.column_stack([circles.center, circles.radius]),
             (upright(self.up, depth, rays), float(np.radians(self.tilt_deg))),
-            (noise, sensor, self.min_points),
+            (noise, sensor, self.outline_sigma_px, self.min_points),
         )
 
 

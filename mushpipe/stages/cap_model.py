@@ -22,12 +22,13 @@ from numpy.typing import NDArray
 from mushpipe.core.jit import inlined, jit
 
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 Cap = tuple[float, ...]
 Vector = tuple[float, float, float]
 LIP = 0.25  # depth of the margin below the rim plane, in rim radii
 SIZE = 15
 N, RADIUS, HEIGHT, BULGE, E1, E2 = 3, 6, 7, 8, 9, 12
-ROOM = 97  # most points or rays of a cap
+ROOM = 169  # most rays of a cap: 8 around the circle, 97 points, 32 each along depth and color edge
 UNKNOWNS = 8  # C (3), turn along e1 and e2 (2), R, h, b
 
 
@@ -158,28 +159,32 @@ def slope(c: Cap, ray: Vector, t: float, k: float) -> tuple[float, ...]:
 
 
 @jit
-def depth_rows(cap: Floats, points: Floats, count: int, flat: Floats) -> None:
-    """Fill a column of rows for each of the measured points.
+def fill_rows(cap: Floats, rays: Singles, count: int, flat: Floats) -> None:
+    """Fill a column of rows for each ray.
 
-    The residual is the distance from the point to the cap along the ray, times the cosine of
-    incidence. A ray that misses has the distance from its closest approach, and a cosine of 0:
-    without that, points just outside the outline would not hold the radius.
+    A ray with a range has hit the cap there: its residual is the distance from that point to the
+    cap along the ray, times the cosine of incidence. If it misses the cap, the residual is the
+    distance from its closest approach, and the cosine 0: without that, points just outside the
+    outline would not hold the radius. A ray without a range touches the cap: its residual is how
+    far outside (negative: inside) of the cap's outline it passes.
 
     Args:
         cap: (15,).
-        points: (5, M): unit ray (3), range and its sigma, m.
-        count: How many columns are points, at most ROOM.
+        rays: (4 or more, M): unit ray (3) and range, m; 0 for a ray that touches.
+        count: How many columns are rays, at most ROOM.
         flat: (14 ROOM,) out, rows of ROOM: derivatives (8), the cosine held fixed; residual, m;
-            cosine; then a copy of the rays and ranges. In one array at fixed distances the
-            compiler sees that nothing overlaps.
+            cosine, 1 for a ray that touches; then a copy of the rays and ranges. In one array at
+            fixed distances the compiler sees that nothing overlaps.
     """
     c = frozen(cap)
     for i in range(4):
         for j in range(count):
-            flat[(10 + i) * ROOM + j] = points[i, j]
+            flat[(10 + i) * ROOM + j] = rays[i, j]
     for j in range(count):
         ray = (flat[j + 10 * ROOM], flat[j + 11 * ROOM], flat[j + 12 * ROOM])
-        t, k, hit = meet(c, ray, False)
+        touches = flat[j + 13 * ROOM] == 0.0
+        t, k, crosses = meet(c, ray, touches)
+        hit = crosses & (not touches)
         p, length, cosine, d0, d1, d2, d3, d4, d5, d6, d7 = slope(c, ray, t, k)
         flat[j], flat[j + ROOM], flat[j + 2 * ROOM], flat[j + 3 * ROOM] = d0, d1, d2, d3
         flat[j + 4 * ROOM], flat[j + 5 * ROOM] = d4, d5
@@ -187,24 +192,4 @@ def depth_rows(cap: Floats, points: Floats, count: int, flat: Floats) -> None:
         # one Newton step from the spheroid without bulge to the surface with it
         off = cosine * (t - flat[j + 13 * ROOM])
         flat[j + 8 * ROOM] = p / length + (off if hit else 0.0)
-        flat[j + 9 * ROOM] = cosine if hit else 0.0
-
-
-@jit
-def tangent_rows(cap: Floats, rays: Floats, count: int, flat: Floats) -> None:
-    """Fill a column of rows for each ray (3, M) of an outline; `flat` as in `depth_rows`.
-
-    The residual is how far outside (negative: inside) the cap's outline the ray passes, m.
-    """
-    c = frozen(cap)
-    for i in range(3):
-        for j in range(count):
-            flat[(10 + i) * ROOM + j] = rays[i, j]
-    for j in range(count):
-        ray = (flat[j + 10 * ROOM], flat[j + 11 * ROOM], flat[j + 12 * ROOM])
-        t, k, _ = meet(c, ray, True)
-        p, length, _, d0, d1, d2, d3, d4, d5, d6, d7 = slope(c, ray, t, k)
-        flat[j], flat[j + ROOM], flat[j + 2 * ROOM], flat[j + 3 * ROOM] = d0, d1, d2, d3
-        flat[j + 4 * ROOM], flat[j + 5 * ROOM] = d4, d5
-        flat[j + 6 * ROOM], flat[j + 7 * ROOM] = d6, d7
-        flat[j + 8 * ROOM] = p / length
+        flat[j + 9 * ROOM] = cosine if hit else (1.0 if touches else 0.0)

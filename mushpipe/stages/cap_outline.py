@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
-from mushpipe.stages.cap_model import Cap, Floats, frozen, meet, slope
-from mushpipe.stages.cap_samples import COMPASS, DIRECTIONS, ray_at
+from mushpipe.stages.cap_model import ROOM, UNKNOWNS, Floats, Singles, fill_rows
+from mushpipe.stages.cap_samples import COMPASS, DIRECTIONS, EDGE_SHARE, ray_at, touch
 
 STEP = 0.5  # px between places on a line
 REACH = 12  # steps to either side that are looked at, at most
@@ -31,17 +31,28 @@ def bright(gray: NDArray[np.float32], x: float, y: float) -> float:
 
 @jit
 def expected_reach(
-    c: Cap, rays: NDArray[np.float32], focal: float, x: float, y: float, radius: float, turn: Floats
-) -> float:
-    """Return how far from (x, y), px, the outline of a cap lies in the direction turn (2,)."""
-    reach = radius
+    cap: Floats, rays: Singles, focal: float, circle: Floats, flat: Floats, reach: Floats
+) -> None:
+    """Fill how far (DIRECTIONS,), px, the outline of a cap lies from the centre of a circle.
+
+    Args:
+        cap: (15,) the cap.
+        rays: (H, W, 2) rays at z = 1.
+        focal: Focal length, px.
+        circle: (3,) x, y, radius, px, near the outline.
+        flat: (14 ROOM,) room for rows.
+        reach: Out, per direction of `COMPASS`.
+    """
+    lines, longest = np.zeros((4, DIRECTIONS), np.float32), 0.3 * circle[2]
+    reach[:] = circle[2]
     for _ in range(2):
-        ray = ray_at(rays, focal, x + reach * turn[0], y + reach * turn[1])
-        t, k, _ = meet(c, ray, True)
-        change = slope(c, ray, t, k)
-        step = change[0] / change[1] * focal / c[2]
-        reach -= min(max(step, -0.3 * radius), 0.3 * radius)
-    return reach
+        for j in range(DIRECTIONS):
+            x, y = circle[0] + reach[j] * COMPASS[j, 0], circle[1] + reach[j] * COMPASS[j, 1]
+            lines[0, j], lines[1, j], lines[2, j] = ray_at(rays, focal, x, y)
+        fill_rows(cap, lines, DIRECTIONS, flat)
+        for j in range(DIRECTIONS):
+            step = flat[UNKNOWNS * ROOM + j] * focal / cap[2]
+            reach[j] -= min(max(step, -longest), longest)
 
 
 @jit
@@ -72,12 +83,14 @@ def steepest(profile: Floats, count: int, sign: float) -> tuple[float, float]:
 def sample_outline(
     gray: NDArray[np.float32],
     rays: NDArray[np.float32],
-    ranks: NDArray[np.int32],
+    ranks: NDArray[np.int16],
     rank: int,
     cap: Floats,
     circle: Floats,
     focal: float,
-    out: Floats,
+    sigma: float,
+    flat: Floats,
+    out: Singles,
 ) -> int:
     """Find the outline of a cap in the colour image, in 32 directions.
 
@@ -89,19 +102,20 @@ def sample_outline(
         cap: (15,) the estimate.
         circle: (3,) x, y, radius, px.
         focal: Focal length, px.
-        out: (3, DIRECTIONS) out: unit rays along the outline.
+        sigma: Of a place on the outline, px.
+        flat: (14 ROOM,) room for rows.
+        out: (6, DIRECTIONS) out: rays that touch the cap, as in `touch`.
 
     Returns:
         Number of rays.
     """
-    c = frozen(cap)
-    profiles = np.empty((DIRECTIONS, 2 * REACH + 1))
-    reaches = np.zeros(DIRECTIONS)
+    profiles, reaches = np.empty((DIRECTIONS, 2 * REACH + 1)), np.empty(DIRECTIONS)
+    expected_reach(cap, rays, focal, circle, flat, reaches)
     half = min(REACH, max(5, int(0.2 * circle[2] / STEP)))
     count, contrast = 2 * half + 1, 0.0
     for j in range(DIRECTIONS):
-        turn = COMPASS[j]
-        reach = expected_reach(c, rays, focal, circle[0], circle[1], circle[2], turn)
+        turn, reach = COMPASS[j], reaches[j]
+        reaches[j] = 0.0
         if not 0.5 * circle[2] < reach < 1.6 * circle[2]:
             continue
         x, y = circle[0] + reach * turn[0], circle[1] + reach * turn[1]
@@ -125,6 +139,6 @@ def sample_outline(
             continue
         reach = reaches[j] + (place - half) * STEP
         x, y = circle[0] + reach * COMPASS[j, 0], circle[1] + reach * COMPASS[j, 1]
-        out[0, n], out[1, n], out[2, n] = ray_at(rays, focal, x, y)
+        touch(out, n, ray_at(rays, focal, x, y), sigma * cap[2] / focal, EDGE_SHARE)
         n += 1
     return n

@@ -14,11 +14,15 @@ from numpy.typing import NDArray
 from mushpipe.core.jit import jit
 
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 Vector = tuple[float, float, float]
 GRID = 11
 DIRECTIONS = 32
 RADII = 26
 INNER, OUTER = 0.55, 1.45  # where an edge is looked for, in radii of the circle
+EDGE_PX = 2.0  # sigma of a depth edge
+# Noise and errors of shape are correlated; so much of a point, or of a ray along an edge, counts.
+POINT_SHARE, EDGE_SHARE = 0.35 * 169 / GRID**2, 0.6
 CORE = 0.35  # squared share of the radius inside which the middle depth is taken
 
 _CENTERS = (np.arange(GRID) + 0.5) / GRID * 2 - 1
@@ -30,30 +34,9 @@ COMPASS: Floats = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=-1)
 
 
 @jit
-def paint(ranks: NDArray[np.int32], circles: Floats, order: NDArray[np.int64]) -> None:
-    """Write into each pixel the rank of the nearest circle that covers it.
-
-    Args:
-        ranks: (H, W) out; the nearest circle has rank 0, where there is none it stays as it is.
-        circles: (N, 3) x, y, radius, px.
-        order: (N,) rows of the circles, the nearest first.
-    """
-    height, width = ranks.shape
-    for rank in range(len(order) - 1, -1, -1):
-        x, y, r = circles[order[rank]]
-        for v in range(max(0, int(np.ceil(y - r))), min(height, int(np.floor(y + r)) + 1)):
-            half = np.sqrt(max(r * r - (v - y) ** 2, 0.0))
-            left = max(0, int(np.ceil(x - half)))
-            right = min(width, int(np.floor(x + half)) + 1)
-            for u in range(left, right):
-                ranks[v, u] = rank
-
-
-@jit
 def block(
-    depth: NDArray[np.float32],
-    rays: NDArray[np.float32],
-    ranks: NDArray[np.int32],
+    depth: Singles,
+    ranks: NDArray[np.int16],
     rank: int,
     place: tuple[int, int, int],
     out: Floats,
@@ -62,33 +45,32 @@ def block(
 
     Args:
         depth: (H, W) m, 0 = missing.
-        rays: (H, W, 2) x and y of each pixel's ray at z = 1; beyond 1e3 where it has none.
         ranks: (H, W) rank of the nearest circle that covers the pixel.
         rank: This circle's; pixels of a lower one are hidden.
         place: u, v, half width of the block, px.
-        out: (4,) out: mean x and y of the rays, mean depth (m) and its variance.
+        out: (4,) out: mean u and v (px), mean depth (m) and its variance.
 
     Returns:
         How many pixels were valid.
     """
     height, width = depth.shape
     u0, v0, half = place
-    count, sx, sy, sz, szz = 0, 0.0, 0.0, 0.0, 0.0
+    count, su, sv, sz, szz = 0, 0, 0, 0.0, 0.0
     first = 0.0
     for v in range(max(0, v0 - half), min(height, v0 + half + 1)):
         for u in range(max(0, u0 - half), min(width, u0 + half + 1)):
             z = float(depth[v, u])
-            if z <= 0.0 or ranks[v, u] < rank or rays[v, u, 0] > 1e3:
+            if z <= 0.0 or ranks[v, u] < rank:
                 continue
             if count == 0:
                 first = z
             count += 1
-            sx += rays[v, u, 0]
-            sy += rays[v, u, 1]
+            su += u
+            sv += v
             sz += z - first
             szz += (z - first) * (z - first)
     if count:
-        out[0], out[1], out[2] = sx / count, sy / count, first + sz / count
+        out[0], out[1], out[2] = su / count, sv / count, first + sz / count
         out[3] = max(szz / count - (sz / count) ** 2, 0.0)
     return count
 
@@ -113,17 +95,18 @@ def sample_depth(
     circle: Floats,
     focal: float,
     noise: tuple[float, float],
-    out: Floats,
+    out: Singles,
 ) -> tuple[int, float]:
     """Take the points of a cap: block means on a grid inside its circle, gated around its depth.
 
     Args:
-        image: Depth (H, W), rays (H, W, 2) and ranks (H, W) as in `block`.
+        image: Depth (H, W), rays (H, W, 2) at z = 1, beyond 1e3 where a pixel has none, and ranks
+            (H, W) as in `block`.
         rank: This circle's.
         circle: (3,) x, y, radius, px.
         focal: Focal length, px.
         noise: Sigma of depth is noise[0] + noise[1] z, m.
-        out: (5, M) out: unit ray, range (m), sigma of the range (m).
+        out: (6, M) out: unit ray, range and its sigma (m), share that counts as independent.
 
     Returns:
         Number of points, and the cap's middle depth (m), 0 where there is none.
@@ -137,7 +120,7 @@ def sample_depth(
     for j in range(len(CELLS)):
         u = int(np.floor(circle[0] + radius * CELLS[j, 0] + 0.5))
         v = int(np.floor(circle[1] + radius * CELLS[j, 1] + 0.5))
-        count[j] = block(depth, rays, ranks, rank, (u, v, half), points[j])
+        count[j] = block(depth, ranks, rank, (u, v, half), points[j])
     middle = middle_depth(points, count, half)
     if middle <= 0.0:
         return 0, 0.0
@@ -151,10 +134,12 @@ def sample_depth(
             continue
         if not middle - 0.8 * size < z < middle + size:
             continue
-        length = np.sqrt(1.0 + points[j, 0] ** 2 + points[j, 1] ** 2)
-        out[0, n], out[1, n], out[2, n] = points[j, 0] / length, points[j, 1] / length, 1 / length
-        out[3, n] = z * length
-        out[4, n] = sigma * (0.3 + 0.7 / np.sqrt(count[j])) * length
+        ray = ray_at(rays, focal, points[j, 0], points[j, 1])
+        if ray[2] < 1e-3:
+            continue  # where the lens has none
+        out[0, n], out[1, n], out[2, n], out[3, n] = ray[0], ray[1], ray[2], z / ray[2]
+        out[4, n] = sigma * (0.3 + 0.7 / np.sqrt(count[j])) / ray[2]
+        out[5, n] = POINT_SHARE
         n += 1
     return n, middle
 
@@ -162,7 +147,7 @@ def sample_depth(
 @jit
 def edge_along(
     depth: NDArray[np.float32],
-    ranks: NDArray[np.int32],
+    ranks: NDArray[np.int16],
     rank: int,
     line: tuple[float, float, float, float],
     gate: tuple[float, float],
@@ -215,7 +200,7 @@ def sample_edges(
     focal: float,
     middle: float,
     offset: float,
-    out: Floats,
+    out: Singles,
 ) -> int:
     """Find the depth edge of a cap in 32 directions.
 
@@ -226,7 +211,7 @@ def sample_edges(
         focal: Focal length, px.
         middle: Middle depth of the cap, m.
         offset: How much of its edge the sensor loses, px.
-        out: (3, DIRECTIONS) out: unit rays along the edge.
+        out: (6, DIRECTIONS) out: rays that touch the cap, as in `touch`.
 
     Returns:
         Number of trusted edge rays.
@@ -245,9 +230,16 @@ def sample_edges(
             continue
         reach = INNER * radius + (edge + 0.5) * step + offset
         ray = ray_at(rays, focal, x + reach * dx, y + reach * dy)
-        out[0, n], out[1, n], out[2, n] = ray
+        touch(out, n, ray, EDGE_PX * middle / focal, EDGE_SHARE)
         n += 1
     return n
+
+
+@jit
+def touch(out: Singles, n: int, ray: Vector, sigma: float, share: float) -> None:
+    """Fill column n of rays (6, M) with one that touches the cap, within sigma (m)."""
+    out[0, n], out[1, n], out[2, n] = ray
+    out[3, n], out[4, n], out[5, n] = 0.0, sigma, share
 
 
 @jit

@@ -1,4 +1,4 @@
-"""Gauss-Newton over all caps of a frame: residuals, robust weights, priors, covariance."""
+"""Gauss-Newton for one cap: residuals, robust weights, priors, covariance."""
 
 from __future__ import annotations
 
@@ -18,112 +18,108 @@ from mushpipe.stages.cap_model import (
     UNKNOWNS,
     Floats,
     N,
-    depth_rows,
+    Singles,
+    fill_rows,
     move,
-    tangent_rows,
 )
-from mushpipe.stages.cap_samples import GRID
 
-ROUND = 8  # rays around the detected circle
+ROUND = 8  # rays around the detected circle, the first columns of a cap's rays
 _TURN = np.arange(ROUND) * (2 * np.pi / ROUND)
 WAVES: Floats = np.stack([np.ones(ROUND), np.cos(_TURN), np.sin(_TURN)]) / ROUND
-# Noise is correlated between pixels; this share of the points counts.
-EFFECTIVE = 0.35 * 169 / GRID**2
 BULGE_LIMIT = 0.15  # beyond, the profile is no longer convex
-DEPTH_CUTS = np.array([400.0, 81.0, 81.0, 16.0])
-EDGE_CUTS = np.array([25.0, 25.0, 9.0, 9.0])
+POINT_CUTS = np.array([400.0, 81.0, 81.0, 16.0])
+TOUCH_CUTS = np.array([25.0, 25.0, 9.0, 9.0])
+STEPS = len(POINT_CUTS)
 
 
 class Noise(NamedTuple):
     """Standard deviations of the model.
 
     Attributes:
-        shape: m, how far a cap's surface departs from the model.
+        shape: In rim radii, how far a cap's surface departs from the model.
         outline: In rim radii, how far its outline does.
         circle_px: Of the detected circle's centre and radius, px.
-        edge_px: Of a depth edge, px.
-        color_px: Of the outline in colour, px.
-        edge_weight: Share of the depth edge's rays that count as independent.
-        color_weight: The same of the rays along the outline in colour.
         aspect: Middle aspect h/R of a cap.
         aspect_sigma: Its spread.
         bulge: Middle bulge of a cap's profile.
         bulge_sigma: Its spread.
+        firm: How many independent rays the stated sigmas are worth, against a cap's residuals.
+        usual: The squared residual of a usual cap, in those sigmas.
     """
 
     shape: float
     outline: float
     circle_px: float
-    edge_px: float
-    color_px: float
-    edge_weight: float
-    color_weight: float
     aspect: float
     aspect_sigma: float
     bulge: float
     bulge_sigma: float
+    firm: float
+    usual: float
 
 
 @jit
-def add_depth(
-    cap: Floats, points: Floats, noise: Any, focal: float, cut: float, work: Any
-) -> float:
-    """Add the points (5, M) of a cap; return the sum of their robust weights."""
-    system, flat, rows, weights = work
-    count = points.shape[1]
-    depth_rows(cap, points, count, flat)
-    total = 0.0
-    for j in range(count):
-        cosine, residual = rows[UNKNOWNS + 1, j], rows[UNKNOWNS, j]
-        missed = 0.0 if cosine > 0.0 else 0.7 * points[3, j] / focal
-        variance = noise.shape**2 + (points[4, j] * cosine) ** 2 + missed**2
-        weight = tukey(residual * residual / variance, cut)
-        total += weight
-        weights[j] = EFFECTIVE * weight / variance
-    scale(rows, weights, count)
-    add(system, rows, count)
-    return total
+def weigh(
+    rows: Floats, rays: Singles, count: int, noise: Any, pixel: float, radius: float, step: int,
+    weights: Floats,
+) -> tuple[float, float]:  # fmt: skip
+    """Fill the weights (M,) of the rows of a cap's rays.
 
+    Args:
+        rows: (10 or more, M) from `fill_rows`.
+        rays: (6, M): unit ray, range (m, 0 for a ray that touches), sigma (m), and the share that
+            counts as independent.
+        count: How many columns are rays.
+        noise: `Noise`.
+        pixel: Angle of a pixel, rad.
+        radius: Of the cap, m.
+        step: Number of the step; weights narrow from one to the next.
+        weights: Out.
 
-@jit
-def add_edges(
-    cap: Floats, edges: Floats, sigma: float, weight: float, cut: float, work: Any
-) -> None:
-    """Add the rays (3, M) along an edge, which touch the cap within sigma (m)."""
-    system, flat, rows, weights = work
-    count = edges.shape[1]
-    tangent_rows(cap, edges, count, flat)
-    variance = sigma * sigma
-    for j in range(count):
-        weights[j] = weight * tukey(rows[UNKNOWNS, j] ** 2 / variance, cut) / variance
-    scale(rows, weights, count)
-    add(system, rows, count)
-
-
-@jit
-def add_circle(cap: Floats, around: Floats, noise: Any, pixel: float, work: Any) -> None:
-    """Add the detected circle's three numbers: mean, cosine and sine of its distance to the cap.
-
-    The rays (3, ROUND) around the circle touch the cap on average; single ones need not, for the
-    outline of a cap is no circle.
+    Returns:
+        Sum of the robust weights of the points, and how many times as large as stated the squared
+        residuals are.
     """
-    system, flat, rows, weights = work
-    tangent_rows(cap, around, ROUND, flat)
+    surface, outline = (noise.shape * radius) ** 2, (noise.outline * radius) ** 2
+    far_cut, touch_cut = POINT_CUTS[min(step, STEPS - 1)], TOUCH_CUTS[min(step, STEPS - 1)]
+    total, misfit, shares = 0.0, 0.0, 0.0
+    for j in range(count):
+        far, sigma, share = rays[3, j], rays[4, j], rays[5, j]
+        cosine, residual = rows[UNKNOWNS + 1, j], rows[UNKNOWNS, j]
+        touches = far == 0.0
+        missed = 0.7 * far * pixel if cosine == 0.0 else 0.0
+        variance = (outline if touches else surface) + (sigma * cosine) ** 2 + missed**2
+        squared, cut = residual * residual / variance, touch_cut if touches else far_cut
+        weight = tukey(squared, cut)
+        total += 0.0 if touches else weight
+        misfit += share * min(squared, cut)
+        shares += share
+        weights[j] = share * weight / variance
+    if step >= STEPS - 1:
+        factor = (noise.firm + misfit / noise.usual) / (noise.firm + shares)
+        for j in range(count):
+            weights[j] /= factor
+    return total, misfit / max(shares, 1e-9)
+
+
+@jit
+def weigh_circle(rows: Floats, variance: float, cut: float, weights: Floats) -> None:
+    """Put the detected circle's three numbers in the place of its rays' rows, the first ROUND.
+
+    Mean, cosine and sine of the rays' distance to the cap: they touch it on average; single ones
+    need not, for the outline of a cap is no circle.
+    """
     for i in range(UNKNOWNS + 1):
-        for w in range(3):
-            total = 0.0
-            for j in range(ROUND):
-                total += WAVES[w, j] * rows[i, j]
-            rows[i, ROUND + w] = total
-    for i in range(UNKNOWNS + 1):
-        for w in range(3):
-            rows[i, w] = rows[i, ROUND + w]
-    variance = (noise.circle_px * pixel) ** 2 + (noise.outline * cap[RADIUS]) ** 2
-    weights[0] = 1.0 / variance
-    # the mean of cos^2 is a half: a shift by d shows as d/2 in the cosine
-    weights[1] = weights[2] = 4.0 / variance
-    scale(rows, weights, 3)
-    add(system, rows, 3)
+        mean, cosine, sine = 0.0, 0.0, 0.0
+        for j in range(ROUND):
+            mean += WAVES[0, j] * rows[i, j]
+            cosine += WAVES[1, j] * rows[i, j]
+            sine += WAVES[2, j] * rows[i, j]
+        rows[i, 0], rows[i, 1], rows[i, 2] = mean, cosine, sine
+    for w in range(3):
+        # the mean of cos^2 is a half: a shift by d shows as d/2 in the cosine
+        precision = (1.0 if w == 0 else 4.0) / variance
+        weights[w] = precision * tukey(rows[UNKNOWNS, w] ** 2 * precision, cut)
 
 
 @jit
@@ -137,22 +133,22 @@ def tilt(cap: Floats, up: Floats) -> tuple[float, float]:
 
 
 @jit
-def add_priors(cap: Floats, upright: tuple[Floats, float], noise: Any, work: Any) -> None:
-    """Add what is known of any cap: its aspect, and that it grows upwards, more or less."""
-    system, _, rows, weights = work
-    rows[: UNKNOWNS + 1, :4] = 0.0
-    rows[5, 0], rows[6, 0] = -noise.aspect, 1.0
-    rows[UNKNOWNS, 0] = cap[HEIGHT] - noise.aspect * cap[RADIUS]
-    weights[0] = 1.0 / (noise.aspect_sigma * cap[RADIUS]) ** 2
+def add_priors(cap: Floats, upright: tuple[Floats, float], noise: Any, system: Any) -> None:
+    """Add what is known of any cap: aspect, bulge, and that it grows upwards, more or less."""
+    normal, gradient = system
+    weight = 1.0 / (noise.aspect_sigma * cap[RADIUS]) ** 2
+    off = weight * (cap[HEIGHT] - noise.aspect * cap[RADIUS])
+    normal[5, 5] += noise.aspect**2 * weight
+    normal[6, 5] -= noise.aspect * weight
+    normal[6, 6] += weight
+    gradient[5] -= noise.aspect * off
+    gradient[6] += off
     lean = tilt(cap, upright[0])
     for w in range(2):
-        rows[3 + w, 1 + w] = 1.0
-        rows[UNKNOWNS, 1 + w] = lean[w]
-        weights[1 + w] = 1.0 / upright[1] ** 2
-    rows[7, 3], rows[UNKNOWNS, 3] = 1.0, cap[BULGE] - noise.bulge
-    weights[3] = 1.0 / noise.bulge_sigma**2
-    scale(rows, weights, 4)
-    add(system, rows, 4)
+        normal[3 + w, 3 + w] += 1.0 / upright[1] ** 2
+        gradient[3 + w] += lean[w] / upright[1] ** 2
+    normal[7, 7] += 1.0 / noise.bulge_sigma**2
+    gradient[7] += (cap[BULGE] - noise.bulge) / noise.bulge_sigma**2
 
 
 @jit
@@ -182,85 +178,56 @@ def workspace() -> Any:
 
 
 @jit
-def build(
-    cap: Floats,
-    data: tuple[Floats, Floats, Floats, Floats],
-    upright: tuple[Floats, float],
-    noise: Any,
-    focal: float,
-    cuts: tuple[float, float],
-    work: Any,
-) -> float:
-    """Fill the normal equations of a cap; return the sum of the weights of its points.
-
-    Args:
-        cap: (15,) the estimate.
-        data: Points (5, M), rays along the depth edge (3, E), around the circle (3, ROUND) and
-            along the outline in colour (3, L).
-        upright: Unit vector (3,) and the spread of tilts off it, rad.
-        noise: `Noise`.
-        focal: Focal length, px.
-        cuts: Squared residuals, of points and edges, beyond which one has no weight.
-        work: From `workspace`.
-    """
-    points, edges, around, outline = data
-    work[0][0][:] = 0.0
-    work[0][1][:] = 0.0
-    pixel = cap[2] / focal
-    total = add_depth(cap, points, noise, focal, cuts[0], work)
-    mismatch = (noise.outline * cap[RADIUS]) ** 2
-    sigma = np.sqrt((noise.edge_px * pixel) ** 2 + mismatch)
-    add_edges(cap, edges, sigma, noise.edge_weight, cuts[1], work)
-    sigma = np.sqrt((noise.color_px * pixel) ** 2 + mismatch)
-    add_edges(cap, outline, sigma, noise.color_weight, cuts[1], work)
-    add_circle(cap, around, noise, pixel, work)
-    add_priors(cap, upright, noise, work)
-    return total
-
-
-@jit
 def refine(
     cap: Floats,
-    data: tuple[Floats, Floats, Floats, Floats],
+    rays: Singles,
+    count: int,
     upright: tuple[Floats, float],
-    noise: Any,
-    focal: float,
-    size: float,
-    first: int,
-    last: int,
+    settings: tuple[Any, float, float],
+    steps: tuple[int, int],
     work: Any,
-) -> bool:
-    """Take Gauss-Newton steps number first to last - 1; False where one has no solution."""
-    normal, gradient = work[0]
-    for k in range(first, last):
-        m = min(k, len(DEPTH_CUTS) - 1)
-        build(cap, data, upright, noise, focal, (DEPTH_CUTS[m], EDGE_CUTS[m]), work)
+) -> tuple[float, float]:
+    """Take Gauss-Newton steps, and leave the last one's normal matrix, factored, in `work`.
+
+    Args:
+        cap: (15,) the estimate, in and out.
+        rays: (6, M) as in `weigh`; the first ROUND lie around the detected circle.
+        count: How many columns are rays.
+        upright: Unit vector (3,) and the spread of tilts off it, rad.
+        settings: `Noise`, the angle of a pixel (rad), and the size of the circle at the cap (m).
+        steps: Numbers of the first step and past the last.
+        work: From `workspace`.
+
+    Returns:
+        Sum of the weights of the points, -1 where a step has no solution; and the misfit.
+    """
+    system, flat, rows, weights = work
+    normal, gradient = system
+    noise, pixel, size = settings
+    total, misfit = 0.0, 0.0
+    for step in range(steps[0], steps[1]):
+        normal[:], gradient[:] = 0.0, 0.0
+        fill_rows(cap, rays, count, flat)
+        total, misfit = weigh(rows, rays, count, noise, pixel, cap[RADIUS], step, weights)
+        variance = (noise.circle_px * pixel * cap[2]) ** 2 + (noise.outline * cap[RADIUS]) ** 2
+        weigh_circle(rows, variance, TOUCH_CUTS[min(step, STEPS - 1)], weights)
+        scale(rows, weights, count)
+        add(system, rows, count)
+        add_priors(cap, upright, noise, system)
         if not cholesky(normal):
-            return False
+            return -1.0, misfit
         substitute(normal, gradient)
         for i in range(UNKNOWNS):
             gradient[i] = -gradient[i]
         limit(cap, gradient, size)
         move(cap, gradient)
-    return True
+    return total, misfit
 
 
 @jit
-def uncertainty(
-    cap: Floats,
-    data: tuple[Floats, Floats, Floats, Floats],
-    upright: tuple[Floats, float],
-    noise: Any,
-    focal: float,
-    covariance: Floats,
-    work: Any,
-) -> float:
-    """Fill the covariance (8, 8) at the solution; return the weight of the points, -1 if none."""
-    total = build(cap, data, upright, noise, focal, (DEPTH_CUTS[-1], EDGE_CUTS[-1]), work)
-    if not cholesky(work[0][0]):
-        return -1.0
+def invert(factor: Floats, out: Floats) -> None:
+    """Fill the inverse (8, 8) of a matrix that `cholesky` has factored."""
     for i in range(UNKNOWNS):
-        covariance[i, :] = 0.0
-        covariance[i, i] = 1.0
-        substitute(work[0][0], covariance[i])
-    return total
+        out[i, :] = 0.0
+        out[i, i] = 1.0
+        substitute(factor, out[i])

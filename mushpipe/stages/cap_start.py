@@ -5,20 +5,20 @@ from __future__ import annotations
 import numpy as np
 
 from mushpipe.core.jit import jit
-from mushpipe.stages.cap_model import BULGE, HEIGHT, RADIUS, Floats, N, Vector, span
+from mushpipe.stages.cap_model import BULGE, HEIGHT, RADIUS, Floats, N, Singles, Vector, span
 
 ASPECT = 0.62
 # The plane through a spheroid's visible points leans 1 - aspect^2 times as much as its axis.
 GAIN = 1 / (1 - ASPECT**2)
 STEEPEST = 0.9  # rad off the line of sight at which a fit may start
 DEGREES = 4.0  # of freedom of Student's t: how readily a leaning cap is let go
-PRIOR_CAPS = 1.0  # the spread that is set counts as much as so many caps
+PRIOR_CAPS = 0.1  # the spread that is set counts as much as so many caps
 NARROWEST = np.radians(2.0)
 
 
 @jit
-def plane(points: Floats, count: int, ray: Vector, out: Floats) -> bool:
-    """Fill the unit normal (3,), towards the camera, of the plane through points (5, M)."""
+def plane(points: Singles, count: int, ray: Vector, out: Floats) -> bool:
+    """Fill the unit normal (3,), towards the camera, of the plane through points (6, M)."""
     matrix, right = np.zeros((3, 3)), np.zeros(3)
     for j in range(count):
         far = points[3, j]
@@ -58,13 +58,13 @@ def lean(axis: Floats, ray: Vector) -> None:
 
 @jit
 def start(
-    cap: Floats, points: Floats, count: int, up: Floats, ray: Vector, middle: float, size: float
+    cap: Floats, points: Singles, count: int, up: Floats, ray: Vector, middle: float, size: float
 ) -> None:
     """Fill a cap (15,) from the circle and the plane through its points.
 
     Args:
         cap: (15,) out.
-        points: (5, M) unit rays, range and sigma, m.
+        points: (6, M) unit rays and range, m.
         count: How many columns are points.
         up: (3,) unit, the axis where the points have no plane.
         ray: Unit, through the circle's centre.

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
-from mushpipe.stages.cap_batch import rank_by_depth
+from mushpipe.stages.cap_order import rank_by_depth
 from mushpipe.stages.cap_samples import CELLS, GRID, block, ray_at
 
 Floats = NDArray[np.float64]
@@ -81,7 +81,7 @@ def sample_inner(
     for j in range(len(INNER)):
         u = int(np.floor(disc[0] + disc[2] * INNER[j, 0] + 0.5))
         v = int(np.floor(disc[1] + disc[2] * INNER[j, 1] + 0.5))
-        counts[n] = block(image[0], image[1], image[2], rank, (u, v, half), means[n])
+        counts[n] = block(image[0], image[2], rank, (u, v, half), means[n])
         n += counts[n] > 0.4 * full
     if n == 0:
         return 0, 0.0
@@ -94,8 +94,11 @@ def sample_inner(
         z = means[j, 2]
         if means[j, 3] > even or not middle - 0.8 * size < z < middle + size:
             continue
-        x = (means[j, 0] - center[0] / center[2]) * focal / disc[2]
-        y = (means[j, 1] - center[1] / center[2]) * focal / disc[2]
+        ray = ray_at(image[1], focal, means[j, 0], means[j, 1])
+        if ray[2] < 1e-3:
+            continue  # where the lens has none
+        x = (ray[0] / ray[2] - center[0] / center[2]) * focal / disc[2]
+        y = (ray[1] / ray[2] - center[1] / center[2]) * focal / disc[2]
         out[0, m], out[1, m], out[2, m] = 1.0, x, y
         out[3, m], out[4, m], out[5, m] = x * x, x * y, y * y
         out[6, m] = z - middle

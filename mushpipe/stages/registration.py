@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -23,6 +24,27 @@ from mushpipe.stages.upright import Up, pixel_rays, upright
 from mushpipe.stages.upright_model import Model, made, read
 
 Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """One mushroom, registered: the pose, and the clouds of the paper's before and after figures.
+
+    Attributes:
+        axis: (3,) unit, the model's own normal vector, turned.
+        apex: (3,) m.
+        fitness: 0..1, ICP's share of the model that found a partner.
+        sample: (M, 3) m, the mushroom's points, thinned.
+        before: (K, 3) m, the model where it started: upright, in the mushroom's size.
+        after: (K, 3) m, the model where it ended.
+    """
+
+    axis: Floats
+    apex: Floats
+    fitness: float
+    sample: Floats
+    before: Floats
+    after: Floats
 
 
 class Registration(Stage):
@@ -74,40 +96,44 @@ class Registration(Stage):
         Raises:
             InputError: The frame has depth but no calibration.
         """
-        if self._model is None:
-            self.open()
         n = len(circles)
         axis, apex, fitness = np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.full(n, np.nan)
-        if frame.depth is not None and n:
-            if frame.camera is None:
-                raise InputError("depth cannot be turned into metres without the calibration")
-            o3d = import_open3d()
-            # seeds RANSAC and the tuple test of FGR; ICP and FPFH draw nothing
-            o3d.utility.random.seed(int(rng.integers(2**31)))
-            depth = np.fmax(frame.depth_m, np.float32(0))
-            rays = pixel_rays(frame.camera)
-            up, focal = upright(self.up, depth, rays), (frame.camera.fx + frame.camera.fy) / 2
-            view = (depth, rays, up, focal)
-            with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-                for i in np.flatnonzero(np.isfinite(locations.distance)):
-                    found = self._pose(view, circles, locations, int(i))
-                    if found is not None:
-                        axis[i], apex[i], fitness[i] = found
+        if frame.depth is not None:
+            seed = int(rng.integers(2**31))
+            for i in np.flatnonzero(np.isfinite(locations.distance)):
+                found = self.align(frame, circles, locations, int(i), seed)
+                if found is not None:
+                    axis[i], apex[i], fitness[i] = found.axis, found.apex, found.fitness
         valid = np.isfinite(axis).all(axis=1)
         return Poses(quaternion_from_axis(axis), axis, apex, np.full(n, np.nan), fitness, valid)
 
-    def _pose(
-        self, view: Any, circles: Circles, locations: Locations, i: int
-    ) -> tuple[Floats, Floats, float] | None:
-        depth, rays, up, focal = view
-        size = circles.radius[i] * locations.position[i, 2] / focal
-        points = _inside(depth, rays, circles.center[i], circles.radius[i], size)
-        deeper = 1 + self._model.top * size / locations.distance[i]
-        return self.register(points, locations.position[i] * deeper, size, up)
+    def align(
+        self, frame: RgbdFrame, circles: Circles, locations: Locations, row: int, seed: int
+    ) -> Alignment | None:
+        """Register the mushroom of one row; the same seed gives what a run of all rows gives.
 
-    def register(
-        self, points: Floats, center: Floats, size: float, up: Floats
-    ) -> tuple[Floats, Floats, float] | None:
+        Returns:
+            None where it has too few points or no location.
+
+        Raises:
+            InputError: The frame has no calibration.
+        """
+        if frame.camera is None:
+            raise InputError("depth cannot be turned into metres without the calibration")
+        if self._model is None:
+            self.open()
+        position, radius = locations.position[row], circles.radius[row]
+        if not np.isfinite(position).all():
+            return None
+        depth, rays = np.fmax(frame.depth_m, np.float32(0)), pixel_rays(frame.camera)
+        size = radius * position[2] / ((frame.camera.fx + frame.camera.fy) / 2)
+        points = _inside(depth, rays, circles.center[row], radius, size)
+        deeper = 1 + self._model.top * size / locations.distance[row]
+        # seeds RANSAC and the tuple test of FGR; ICP and FPFH draw nothing
+        import_open3d().utility.random.seed((seed + row) % 2**31)
+        return self.register(points, position * deeper, size, upright(self.up, depth, rays))
+
+    def register(self, points: Floats, center: Floats, size: float, up: Floats) -> Alignment | None:
         """Register the model to the points of one mushroom.
 
         Args:
@@ -117,7 +143,7 @@ class Registration(Stage):
             up: (3,) unit, how the model stands at the start.
 
         Returns:
-            Axis (3,), apex (3,) m and ICP's fitness 0..1; None where there are too few points.
+            None where there are too few points.
         """
         o3d, model = import_open3d(), self._model
         if not isinstance(model, Model) or len(points) < self.min_points:
@@ -130,14 +156,19 @@ class Registration(Stage):
             return None
         self._orient(o3d, target, -center / size)
         source = _cloud(o3d, model.points @ turn.T, model.normals @ turn.T)
-        start = self._start(o3d, source, target)
-        if up @ start[:3, :3] @ up < np.cos(np.radians(self.steepest_deg)):
-            start = np.eye(4)  # a smooth cap fits upside down as well
-        result = self._refine(o3d, source, target, start)
+        with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+            start = self._start(o3d, source, target)
+            if up @ start[:3, :3] @ up < np.cos(np.radians(self.steepest_deg)):
+                start = np.eye(4)  # a smooth cap fits upside down as well
+            result = self._refine(o3d, source, target, start)
         total = np.asarray(result.transformation)
         axis = total[:3, :3] @ turn @ model.axis
         apex = total[:3, :3] @ (turn @ (model.top * model.axis)) + total[:3, 3]
-        return axis / np.linalg.norm(axis), apex * size + center, float(min(result.fitness, 1.0))
+        before, sample = np.asarray(source.points), np.asarray(target.points)
+        after = before @ total[:3, :3].T + total[:3, 3]
+        clouds = (cloud * size + center for cloud in (sample, before, after))
+        fitness = float(min(result.fitness, 1.0))
+        return Alignment(axis / np.linalg.norm(axis), apex * size + center, fitness, *clouds)
 
     def _orient(self, o3d: Any, cloud: Any, eye: Floats) -> None:
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(3 * self.voxel, 30))

@@ -91,7 +91,7 @@ class SurfaceFit(Stage):
             discs: (N, 3) x, y, radius, px.
         """
         n = len(discs)
-        image = (depth, pixel_rays(camera), np.full(depth.shape, n, np.int32))
+        image = (depth, pixel_rays(camera), np.full(depth.shape, n, np.int16))
         noise = (self.depth_noise_mm / 1000, self.depth_noise_per_m / 1000)
         surface = np.full((n, COEFFICIENTS), np.nan)
         covariance = np.full((n, COEFFICIENTS, COEFFICIENTS), np.nan)

@@ -8,7 +8,7 @@ from scipy.spatial.distance import cdist
 
 from mushpipe.core.jit import jit
 from mushpipe.core.tables import Circles, Floats, Locations
-from mushpipe.stages.cap_samples import paint
+from mushpipe.stages.cap_order import paint
 
 
 def hidden_share(circles: Circles, distance: Floats, image: tuple[int, int]) -> Floats:
@@ -24,13 +24,13 @@ def hidden_share(circles: Circles, distance: Floats, image: tuple[int, int]) -> 
     rank = np.empty(n, np.int64)
     rank[order] = np.arange(n)
     discs = np.column_stack([circles.center, circles.radius])
-    ranks = np.full(image[::-1], n, np.int32)
+    ranks = np.full(image[::-1], n, np.int16)
     paint(ranks, discs, order)
     return covered(ranks, discs, rank)
 
 
 @jit
-def covered(ranks: NDArray[np.int32], discs: Floats, rank: NDArray[np.int64]) -> Floats:
+def covered(ranks: NDArray[np.int16], discs: Floats, rank: NDArray[np.int64]) -> Floats:
     """Return the share (N,) of each disc's pixels that bear a lower rank than its own.
 
     Args:

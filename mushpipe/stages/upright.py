@@ -7,16 +7,26 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from mushpipe import Camera
 from mushpipe.stages.bed import CELL, far_cells, fit_plane
 
 Floats = NDArray[np.float64]
+Vector = tuple[float, float, float]
+
+
+def _with_direction(vector: Vector) -> Vector:
+    if not any(vector):
+        raise ValueError("the upright has no direction: a vector needs a component that is not 0")
+    return vector
+
+
 Up = Annotated[
-    Literal["bed", "camera"] | tuple[float, float, float],
+    Literal["bed", "camera"] | Annotated[Vector, AfterValidator(_with_direction)],
     Field(
-        description="the upright: the bed's normal, towards the camera, or a vector in its frame"
+        description="the upright: the bed's normal, towards the camera, or a vector in its optical "
+        "frame: an accelerometer's reading at rest, which is gravity turned round"
     ),
 ]
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from mushpipe import Camera, Circles, DepthSource, InputError, Locations, Poses, RgbdFrame
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_model import ROOM, SIZE, depth_rows, move, span, tangent_rows
+from mushpipe.stages.cap_model import ROOM, SIZE, fill_rows, move, span
 from mushpipe.stages.upright import pixel_rays, upright
 from tests.stages.caps import CAMERA, Cap, cap, circles_of, draw, frame_from
 
@@ -192,6 +192,25 @@ def test_where_tilt_cannot_be_seen_the_sigma_says_so() -> None:
     assert ball.sigma_rad[0] > 2 * flat.sigma_rad[0]
 
 
+def test_a_cap_that_does_not_fit_the_model_says_so_in_its_sigmas() -> None:
+    true = cap(15, 60, (0, 0, 0.4), 0.022, 0.55)
+    depth, gray = draw([true], 0.44)
+    v, u = np.mgrid[:240, :320]
+    knobs = 0.003 * np.sin(u / 5) * np.sin(v / 5)
+    stage, circles = CapFit(up="camera"), circles_of([true])
+    locations, poses = stage.process(frame_from(depth, gray), circles)
+    lumpy = np.where(depth < 0.44, depth + knobs, depth)
+    others, lumps = stage.process(frame_from(lumpy, gray), circles)
+    assert lumps.sigma_rad[0] > 1.3 * poses.sigma_rad[0]
+    assert others.sigma_diameter[0] > 1.2 * locations.sigma_diameter[0]
+    assert angle(lumps.axis[0], true.axis) < 3 * np.degrees(lumps.sigma_rad[0])
+
+
+def test_an_upright_without_direction_is_refused() -> None:
+    with pytest.raises(ValueError, match="the upright has no direction"):
+        CapFit.model_validate({"up": [0, 0, 0]})
+
+
 def some_cap(bulge: float) -> np.ndarray:
     values = np.zeros(SIZE)
     values[:3] = [0.01, -0.02, 0.41]
@@ -209,16 +228,15 @@ def test_derivatives_agree_with_finite_differences(kind: str, bulge: float) -> N
     far = rng.uniform(0, 0.75, count) if kind == "depth" else rng.uniform(0.97, 1.03, count)
     offset = state[6] * far[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     target = state[:3] + np.column_stack([offset, np.zeros(count)])
-    points = np.zeros((5, count))
+    points = np.zeros((4, count))
     points[3] = np.linalg.norm(target, axis=1)
     points[:3] = (target / points[3][:, None]).T
+    if kind == "tangent":
+        points[3] = 0  # a ray that touches
 
     def rows(at: np.ndarray) -> np.ndarray:
         flat = np.zeros(14 * ROOM)
-        if kind == "depth":
-            depth_rows(at, points, count, flat)
-        else:
-            tangent_rows(at, points[:3].copy(), count, flat)
+        fill_rows(at, points, count, flat)
         return flat.reshape(14, ROOM)[:, :count]
 
     base, eps = rows(state), 1e-7

@@ -52,9 +52,9 @@ def test_a_clean_cloud_of_the_model_itself_is_found(local: str, start: str) -> N
         result = found.register(points, np.array([0.03, -0.02, 0.4]), 0.02, UP)
         assert result is not None
         # what the camera does not see of the model pulls it back to where it stood
-        assert angle(result[0], axis) < 9
-        assert np.linalg.norm(result[1] - ([0.03, -0.02, 0.4] + 0.62 * 0.02 * axis)) < 4.5e-3
-        assert 0.8 < result[2] <= 1
+        assert angle(result.axis, axis) < 9
+        assert np.linalg.norm(result.apex - ([0.03, -0.02, 0.4] + 0.62 * 0.02 * axis)) < 4.5e-3
+        assert 0.8 < result.fitness <= 1
 
 
 def test_the_pieces_are_those_of_open3d_called_by_hand() -> None:
@@ -62,7 +62,7 @@ def test_the_pieces_are_those_of_open3d_called_by_hand() -> None:
     center = np.array([0.03, -0.02, 0.4])
     ours = stage(model="cap", **{"global": "fgr"})
     o3d.utility.random.seed(5)
-    axis, apex, _ = ours.register(points, center, 0.02, UP) or pytest.fail("no pose")
+    found = ours.register(points, center, 0.02, UP) or pytest.fail("no pose")
 
     model, flip = made(False, 0.12), np.diag([1.0, -1.0, -1.0])
     source = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(model.points @ flip))
@@ -90,8 +90,27 @@ def test_the_pieces_are_those_of_open3d_called_by_hand() -> None:
         r.TransformationEstimationPointToPoint(),
         r.ICPConvergenceCriteria(max_iteration=200),
     ).transformation
-    assert axis == pytest.approx(fine[:3, :3] @ [0, 0, -1], abs=1e-4)
-    assert apex == pytest.approx((fine @ [0, 0, -0.62, 1])[:3] * 0.02 + center, abs=1e-5)
+    assert found.axis == pytest.approx(fine[:3, :3] @ [0, 0, -1], abs=1e-4)
+    assert found.apex == pytest.approx((fine @ [0, 0, -0.62, 1])[:3] * 0.02 + center, abs=1e-5)
+
+
+def test_the_clouds_before_and_after_show_the_model_move_onto_the_sample() -> None:
+    points, _ = seen(15, 40)
+    ours = stage(model="cap", voxel=0.08, **{"global": "none"})
+    found = ours.register(points, np.array([0.034, -0.023, 0.402]), 0.02, UP)
+    assert found is not None
+
+    def distance(model: np.ndarray) -> float:
+        away = np.linalg.norm(points[:, None] - model[None], axis=2)
+        return float(np.sqrt((away.min(axis=1) ** 2).mean()))
+
+    assert distance(found.sample) < 0.08 * 0.02  # the points themselves, thinned
+    assert distance(found.after) < 0.5 * distance(found.before)
+    # the model is moved as a rigid body, and its top ends at the apex
+    top = np.argmin(np.linalg.norm(found.after - found.apex, axis=1))
+    assert np.linalg.norm(found.after[top] - found.apex) < 0.08 * 0.02
+    sides = [np.linalg.norm(c - c.mean(axis=0), axis=1) for c in (found.before, found.after)]
+    assert sides[0] == pytest.approx(sides[1])
 
 
 def scene() -> tuple[np.ndarray, np.ndarray, Circles]:

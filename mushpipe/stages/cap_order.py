@@ -1,0 +1,60 @@
+"""Which circle hides which: the nearer one, by the depth in its middle."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mushpipe.core.jit import jit
+from mushpipe.stages.cap_model import Floats, Singles
+
+
+@jit
+def paint(ranks: NDArray[np.int16], circles: Floats, order: NDArray[np.int64]) -> None:
+    """Write into each pixel the rank of the nearest circle that covers it.
+
+    Args:
+        ranks: (H, W) out; the nearest circle has rank 0, where there is none it stays as it is.
+        circles: (N, 3) x, y, radius, px.
+        order: (N,) rows of the circles, the nearest first.
+    """
+    height, width = ranks.shape
+    for rank in range(len(order) - 1, -1, -1):
+        x, y, r = circles[order[rank]]
+        for v in range(max(0, int(np.ceil(y - r))), min(height, int(np.floor(y + r)) + 1)):
+            half = np.sqrt(max(r * r - (v - y) ** 2, 0.0))
+            left = max(0, int(np.ceil(x - half)))
+            right = min(width, int(np.floor(x + half)) + 1)
+            for u in range(left, right):
+                ranks[v, u] = rank
+
+
+@jit
+def core_depth(depth: Singles, circle: Floats) -> float:
+    """Return the median depth (m) near the centre of a circle (x, y, r), 0 without any."""
+    values = np.empty(25)
+    n = 0
+    for i in range(-2, 3):
+        for j in range(-2, 3):
+            u = int(np.floor(circle[0] + 0.24 * i * circle[2] + 0.5))
+            v = int(np.floor(circle[1] + 0.24 * j * circle[2] + 0.5))
+            if 0 <= v < depth.shape[0] and 0 <= u < depth.shape[1] and depth[v, u] > 0:
+                values[n] = depth[v, u]
+                n += 1
+    return float(np.median(values[:n])) if n else 0.0
+
+
+@jit
+def rank_by_depth(depth: Singles, circles: Floats, ranks: NDArray[np.int16]) -> NDArray[np.int64]:
+    """Return each circle's rank (N,), the nearest 0, and paint them over a `ranks` full of N."""
+    far = np.empty(len(circles))
+    for i in range(len(circles)):
+        far[i] = core_depth(depth, circles[i])
+        if far[i] <= 0.0:
+            far[i] = 1e30  # hides nothing
+    order = np.argsort(far)
+    paint(ranks, circles, order)
+    rank = np.empty(len(circles), np.int64)
+    for k in range(len(circles)):
+        rank[order[k]] = k
+    return rank
