@@ -6,12 +6,12 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test lint types unit test-slow recordings clean
+.PHONY: demo test lint types docs unit test-slow recordings clean
 
 demo: $(STAMP)
 	$(BIN)/mushpipe run graphs/demo.yaml
 
-test: $(STAMP)-dev system-libraries lint types unit
+test: $(STAMP)-dev system-libraries lint types docs unit
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -43,6 +43,10 @@ lint: $(STAMP)-dev
 
 types: $(STAMP)-dev
 	$(BIN)/mypy
+
+# The site goes to out/site; `mkdocs serve` shows it while it is written.
+docs: $(STAMP)-dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --site-dir out/site
 
 unit: $(STAMP)-dev
 	$(BIN)/pytest -m 'not slow'

@@ -29,4 +29,5 @@ def mushpipe_register(registry: Registry) -> None:
     registry.stage("picks", "mushpipe.stages.picks:MakePicks")
     registry.sink("mcap", "mushpipe.sinks.mcap:McapSink")
     registry.sink("rerun", "mushpipe.sinks.rerun:RerunSink")
+    registry.sink("foxglove", "mushpipe.sinks.foxglove:FoxgloveSink")
     registry.sink("robot-json", "mushpipe.sinks.robot_json:RobotJsonSink")

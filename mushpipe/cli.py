@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,6 +16,7 @@ from mushpipe.evaluate.cli import register as register_eval
 from mushpipe.proof.cli import register as register_proof
 from mushpipe.record import register as register_record
 from mushpipe.robot.commands import app as robot_app
+from mushpipe.viewing import register as register_viewing
 
 if TYPE_CHECKING:
     from mushpipe.core.plan import Plan
@@ -70,7 +71,9 @@ def _out(text: str) -> None:
     sys.stdout.write(text + "\n")
 
 
-def _compile(graph: Path, overrides: list[Any], source: str | None) -> Plan:
+def _compile(
+    graph: Path, overrides: list[Any], source: str | None, more_sinks: Sequence[str] = ()
+) -> Plan:
     import logging
 
     from mushpipe.core.capsule import capsule_document
@@ -79,6 +82,10 @@ def _compile(graph: Path, overrides: list[Any], source: str | None) -> Plan:
     from mushpipe.core.plugins import load_registry
 
     document = capsule_document(graph) if graph.suffix == ".mcap" else read_document(graph)
+    for name in more_sinks:
+        sinks = document.data.get("sinks") or {}
+        if isinstance(sinks, dict):
+            document.data["sinks"] = {name: {"use": name}, **sinks}
     plan = compile_document(document, load_registry(), overrides, source)
     for warning in plan.warnings:
         logging.getLogger("mushpipe").warning(warning)
@@ -97,6 +104,7 @@ def run(
         float | None, typer.Option(help="pace: 1 is real time, 0 as fast as possible")
     ] = None,
     loop: Annotated[int | None, typer.Option(help="times to play; 0 is for ever")] = None,
+    foxglove: Annotated[bool, typer.Option(help="serve it live to the Foxglove app")] = False,
     manifest: Annotated[Path | None, typer.Option(help="where to write run.json")] = None,
     capsules: Annotated[Path, typer.Option(help="folder for failing frames")] = Path("failures"),
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log more")] = False,
@@ -112,7 +120,8 @@ def run(
         for key, value in flags.items()
         if value is not None
     ]
-    plan = _compile(graph, [*overrides, *(set_ or [])], source)
+    more = ["foxglove"] if foxglove else []
+    plan = _compile(graph, [*overrides, *(set_ or [])], source, more)
     raise typer.Exit(execute(plan, manifest or manifest_path(plan), capsules).exit_code)
 
 
@@ -218,6 +227,7 @@ def plugins_describe(
 
 
 register_eval(app)
+register_viewing(app)
 register_record(app)
 register_doctor(app)
 register_proof(app)

@@ -70,7 +70,7 @@ def progress_bar(size: Callable[[], int] | None = None) -> Iterator[Any]:
         return
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     with Progress(*columns, console=stderr, transient=True) as bar:
-        task = bar.add_task("waiting for the first frame", total=None)
+        task = bar.add_task("preparing; the first run of all compiles", total=None)
         started = time.monotonic()
 
         def show(report: RunReport) -> None:

@@ -130,14 +130,19 @@ def _describe_class(kind: Kind, name: str, plugin: type[Plugin]) -> str:
     lines = [f"{kind} {name}", "", inspect.getdoc(plugin) or "", ""]
     lines.append(f"inputs   {', '.join(inputs) or 'none'}")
     lines.append(f"outputs  {', '.join(outputs) or 'none'}")
-    rows = _settings(plugin.model_json_schema())
+    rows = settings_rows(plugin)
     if rows:
         lines += ["", *_columns([("setting", "type", "default", "meaning"), *rows], "")]
     return "\n".join(lines)
 
 
+def settings_rows(plugin: type[Plugin]) -> list[tuple[str, ...]]:
+    """Return name, type, default and meaning of each setting of a plugin."""
+    return _settings(plugin.model_json_schema())
+
+
 def _settings(schema: dict[str, Any], prefix: str = "") -> list[tuple[str, ...]]:
-    """Return name, type, default and meaning per setting; a group's own settings follow it."""
+    """Return the rows of a JSON Schema; a group's own settings follow it."""
     rows: list[tuple[str, ...]] = []
     for key, field in schema.get("properties", {}).items():
         group = schema.get("$defs", {}).get(field.get("$ref", "").rpartition("/")[2])

@@ -8,6 +8,7 @@ from mushpipe.core.plan import Node, Plan
 from mushpipe.core.types import Trace
 
 _SHAPES = {"source": ("([", "])"), "stage": ("[", "]"), "sink": ("[/", "/]")}
+_EVERYTHING = "everything"
 _DOT_SHAPES = {"source": "oval", "stage": "box", "sink": "parallelogram"}
 
 
@@ -16,14 +17,13 @@ def _nodes(plan: Plan) -> tuple[Node, ...]:
 
 
 def _edges(plan: Plan) -> Iterator[tuple[str, str, str]]:
-    """Yield (producer, consumer, type); a sink that records everything has one edge per stage."""
+    """Yield (producer, consumer, type); a sink that takes everything hangs below the last stage."""
     types = {node.name: node.ports.outputs for node in _nodes(plan)}
     for node in _nodes(plan):
         for link in node.links.values():
             yield link.producer, node.name, types[link.producer][link.output].__name__
         if any(port.type is Trace for port in node.ports.inputs):
-            for other in (plan.source, *plan.stages):
-                yield other.name, node.name, ""
+            yield (plan.source, *plan.stages)[-1].name, node.name, _EVERYTHING
 
 
 def _text(plan: Plan, node: Node) -> tuple[str, str]:
@@ -40,7 +40,7 @@ def mermaid(plan: Plan) -> str:
         name, detail = _text(plan, node)
         lines.append(f'  {ids[node.name]}{begin}"{name}<br/><small>{detail}</small>"{end}')
     for producer, consumer, label in _edges(plan):
-        arrow = f"-->|{label}|" if label else "-.->"
+        arrow = f"{'-.->' if label == _EVERYTHING else '-->'}|{label}|"
         lines.append(f"  {ids[producer]} {arrow} {ids[consumer]}")
     return "\n".join(lines)
 
@@ -53,6 +53,6 @@ def dot(plan: Plan) -> str:
         label = f"{name}\\n{detail}".replace('"', '\\"')
         lines.append(f'  "{name}" [shape={_DOT_SHAPES[node.kind]}, label="{label}"];')
     for producer, consumer, label in _edges(plan):
-        style = f'label="{label}"' if label else "style=dashed"
+        style = f'label="{label}"{", style=dashed" if label == _EVERYTHING else ""}'
         lines.append(f'  "{producer}" -> "{consumer}" [{style}];')
     return "\n".join([*lines, "}"])

@@ -35,7 +35,8 @@ class Node:
 
     def resolved(self) -> dict[str, Any]:
         """Return the node's entry in a graph file, with every setting written out."""
-        entry: dict[str, Any] = {"use": self.use, **self.plugin.model_dump(mode="json")}
+        settings = self.plugin.model_dump(mode="json", by_alias=True)
+        entry: dict[str, Any] = {"use": self.use, **settings}
         if self.asked:
             entry["inputs"] = self.asked
         if self.delivery:

@@ -25,6 +25,7 @@ DEPTH_TOPIC = "/camera/aligned_depth_to_color/image_raw"
 CAMERA_TOPIC = "/camera/color/camera_info"
 RESULT_PREFIX = "/mushpipe/"
 TIMING_TOPIC = "/mushpipe/timing"
+DRAWINGS = ("foxglove.ImageAnnotations", "foxglove.SceneUpdate")  # made of the tables beside them
 # name here -> name in ROS and Foxglove
 DISTORTION_MODELS = {
     "none": "",
@@ -69,14 +70,16 @@ def encoder_of(kind: type) -> Encoder | None:
 
 
 @cache
-def _foxglove(name: str) -> Schema:
+def foxglove_schema(name: str) -> Schema:
+    """Return the schema of a message of Foxglove's."""
     import foxglove.messages
 
     schema = getattr(foxglove.messages, name).get_schema()
     return Schema(schema.name, schema.encoding, schema.data, "protobuf")
 
 
-def _stamp(stamp_ns: int) -> Any:
+def timestamp(stamp_ns: int) -> Any:
+    """Return a foxglove.Timestamp."""
     from foxglove.messages import Timestamp
 
     return Timestamp(sec=stamp_ns // 10**9, nsec=stamp_ns % 10**9)
@@ -87,7 +90,7 @@ def encode_image(image: np.ndarray[Any, Any], encoding: str, header: Header) -> 
     from foxglove.messages import RawImage
 
     return RawImage(
-        timestamp=_stamp(header.stamp_ns),
+        timestamp=timestamp(header.stamp_ns),
         frame_id=header.frame_id,
         width=image.shape[1],
         height=image.shape[0],
@@ -101,7 +104,7 @@ def encode_color(frame: RgbdFrame, jpeg_quality: int | None = None) -> Message:
     """Encode the colour image, lossless or as JPEG."""
     if jpeg_quality is None:
         data = encode_image(frame.color, "rgb8", frame.header)
-        return Message("", _foxglove("RawImage"), data)
+        return Message("", foxglove_schema("RawImage"), data)
     import cv2
     from foxglove.messages import CompressedImage
 
@@ -109,12 +112,12 @@ def encode_color(frame: RgbdFrame, jpeg_quality: int | None = None) -> Message:
         ".jpg", frame.color[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]
     )
     image = CompressedImage(
-        timestamp=_stamp(frame.header.stamp_ns),
+        timestamp=timestamp(frame.header.stamp_ns),
         frame_id=frame.header.frame_id,
         data=buffer.tobytes(),
         format="jpeg",
     )
-    return Message("", _foxglove("CompressedImage"), image.encode())
+    return Message("", foxglove_schema("CompressedImage"), image.encode())
 
 
 def encode_depth(frame: RgbdFrame) -> Message:
@@ -130,7 +133,7 @@ def encode_depth(frame: RgbdFrame) -> Message:
         encoding = "16UC1" if frame.depth_scale == 0.001 else "mono16"
     data = encode_image(frame.depth, encoding, frame.header)
     metadata = {"depth_scale": repr(float(frame.depth_scale))}
-    return Message("", _foxglove("RawImage"), data, metadata)
+    return Message("", foxglove_schema("RawImage"), data, metadata)
 
 
 def encode_camera(camera: Camera, header: Header) -> Message:
@@ -139,7 +142,7 @@ def encode_camera(camera: Camera, header: Header) -> Message:
 
     k = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0]
     message = CameraCalibration(
-        timestamp=_stamp(header.stamp_ns),
+        timestamp=timestamp(header.stamp_ns),
         frame_id=header.frame_id,
         width=camera.width,
         height=camera.height,
@@ -149,7 +152,7 @@ def encode_camera(camera: Camera, header: Header) -> Message:
         R=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
         P=[*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0],
     )
-    return Message("", _foxglove("CameraCalibration"), message.encode())
+    return Message("", foxglove_schema("CameraCalibration"), message.encode())
 
 
 def _encode_frame(frame: RgbdFrame, header: Header) -> Iterator[Message]:
@@ -163,11 +166,13 @@ def _encode_mask(mask: Mask, header: Header) -> Iterator[Message]:
     for suffix, image in (("", mask.foreground), ("/initial", mask.initial)):
         if image is not None:
             pixels = image.view(np.uint8) * np.uint8(255)
-            yield Message(suffix, _foxglove("RawImage"), encode_image(pixels, "mono8", header))
+            yield Message(
+                suffix, foxglove_schema("RawImage"), encode_image(pixels, "mono8", header)
+            )
 
 
 def _encode_instances(instances: Instances, header: Header) -> Iterator[Message]:
-    yield Message("", _foxglove("RawImage"), encode_image(instances.labels, "mono16", header))
+    yield Message("", foxglove_schema("RawImage"), encode_image(instances.labels, "mono16", header))
 
 
 def _encode_table(table: Columns, header: Header) -> Iterator[Message]:

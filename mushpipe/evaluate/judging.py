@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +11,7 @@ from mushpipe.evaluate.events import UP, Events, Verdict, comparable, events_of,
 from mushpipe.evaluate.metrics import Value, measure
 from mushpipe.evaluate.results import Results, none_found
 from mushpipe.evaluate.truth import Place, TruthSet, has_truth, read_truth
+from mushpipe.traces import source_recording
 
 
 @dataclass(frozen=True)
@@ -163,26 +163,10 @@ def find_truth(results: Results) -> TruthSet:
     if has_truth(results.path):
         return read_truth(results.path)
     stated = results.manifest.get("recordings") or [{}]
-    path = origin(results)
+    path = source_recording(results.path, results.manifest)
     if path is None:
         of = f" of {stated[0]['file']}" if stated[0].get("file") else ""
         raise InputError(f"{results.path}: the truth{of} is not to be found; give it with --truth")
     if not has_truth(path):
         raise InputError(f"{path}: it carries no truth; give labels with --truth")
     return read_truth(path)
-
-
-def origin(results: Results) -> Path | None:
-    """Return the recording that results were made from, where it is still to be found."""
-    source = Path(str(results.manifest.get("graph", {}).get("source", {}).get("path", "")))
-    stated = (results.manifest.get("recordings") or [{}])[0]
-    folder = results.path.parent
-    for path in (source, folder / source, folder / source.name):
-        if path.is_file() and _sha256(path) == stated.get("sha256"):
-            return path
-    return None
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

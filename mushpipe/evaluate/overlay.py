@@ -15,8 +15,9 @@ from mushpipe.core.recording import RecordingReader
 from mushpipe.core.types import RgbdFrame
 from mushpipe.core.wire import COLOR_TOPIC
 from mushpipe.evaluate.events import Verdict
-from mushpipe.evaluate.judging import Judged, origin
+from mushpipe.evaluate.judging import Judged
 from mushpipe.evaluate.truth import Place
+from mushpipe.traces import source_recording
 
 logger = logging.getLogger("mushpipe")
 
@@ -56,7 +57,9 @@ def _with_images(judged: Judged) -> Path | None:
     if judged.recording is not None:
         return judged.recording
     path = judged.results.path
-    return path if COLOR_TOPIC in RecordingReader(path).index().channels else origin(judged.results)
+    if COLOR_TOPIC in RecordingReader(path).index().channels:
+        return path
+    return source_recording(path, judged.results.manifest)
 
 
 def overlay(verdict: Verdict, frame: RgbdFrame | None) -> str:

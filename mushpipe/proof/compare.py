@@ -52,7 +52,7 @@ class Comparison:
 
 
 def compare(a: Path, b: Path, tolerance: float = 0.0, topics: str = "*") -> Comparison:
-    """Compare two recordings; the time the stages took is left out.
+    """Compare two recordings; the time the stages took and what is drawn of results are left out.
 
     Messages belong together by topic, sensor time and sequence, in whatever order they stand.
 
@@ -97,7 +97,8 @@ def _keyed(reader: RecordingReader, topics: str) -> Iterator[tuple[Key, Raw]]:
     seen: Counter[tuple[str, int, int]] = Counter()
     for raw in reader.messages():
         topic, message = raw.channel.topic, raw.message
-        if topic == wire.TIMING_TOPIC or not fnmatchcase(topic, topics):
+        derived = raw.schema is not None and raw.schema.name in wire.DRAWINGS
+        if derived or topic == wire.TIMING_TOPIC or not fnmatchcase(topic, topics):
             continue
         place = (topic, message.publish_time, message.sequence)
         yield Key(*place, seen[place]), raw

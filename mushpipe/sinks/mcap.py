@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Mapping
 from glob import escape
 from pathlib import Path
@@ -12,12 +11,10 @@ from typing import Any, ClassVar, Literal
 from pydantic import ByteSize, Field, PrivateAttr
 
 from mushpipe import GraphPath, RunInfo, Sink, Trace
-from mushpipe.core import wire
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.recording import MANIFEST, SUMMARY
 from mushpipe.core.stage import STDIO
-
-logger = logging.getLogger("mushpipe")
+from mushpipe.sinks.messages import result_messages, timing_message
 
 
 class McapSink(Sink):
@@ -32,6 +29,9 @@ class McapSink(Sink):
     frames: bool = Field(True, description="record colour and depth beside the results")
     jpeg_quality: int | None = Field(
         None, ge=1, le=100, description="store colour as JPEG of this quality; lossless if not set"
+    )
+    drawings: bool = Field(
+        True, description="record how viewers draw circles and picks, beside the tables"
     )
     timing: bool = Field(True, description="record the time each stage took")
     split_size: ByteSize | None = Field(
@@ -72,13 +72,10 @@ class McapSink(Sink):
         writer, frame = self._next_writer(), trace.frame
         if self.frames:
             writer.frame(frame, self.jpeg_quality)
-        for stage in trace.durations_ns:
-            for value in trace.outputs[stage]:
-                self._write(writer, stage, value, trace)
+        for topic, message in result_messages(trace, self._unknown, self.drawings):
+            writer.write(topic, message, frame.header)
         if self.timing and trace.durations_ns:
-            content = {"stages_ns": dict(trace.durations_ns)}
-            message = wire.json_message(wire.TIMING, frame.header, content)
-            writer.write(wire.TIMING_TOPIC, message, frame.header)
+            writer.write(*timing_message(trace), frame.header)
 
     def _next_writer(self) -> RecordingWriter:
         """Return the writer of the part in work, or of a new one where that has its size."""
@@ -92,18 +89,6 @@ class McapSink(Sink):
         self._part += 1
         self._writer = self._begin(run)
         return self._writer
-
-    def _write(self, writer: RecordingWriter, stage: str, value: Any, trace: Trace) -> None:
-        if wire.encoder_of(type(value)) is None:
-            if type(value) not in self._unknown:
-                self._unknown.add(type(value))
-                logger.warning(
-                    "%s is not recorded: %s is not a Columns type", stage, type(value).__name__
-                )
-            return
-        # Several outputs of one stage need several topics; the first keeps the stage's own.
-        own = "" if value is trace.outputs[stage][0] else f"/{type(value).__name__.lower()}"
-        writer.value(f"{wire.RESULT_PREFIX}{stage}{own}", value, trace.frame.header)
 
     def finish(self, summary: Mapping[str, Any]) -> None:
         """Write the run's counts at the end."""

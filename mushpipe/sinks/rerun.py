@@ -2,143 +2,248 @@
 
 from __future__ import annotations
 
+import logging
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections import deque
 from pathlib import Path
 from typing import Any, ClassVar, Literal
+from urllib.parse import urlsplit
 
-import numpy as np
 from pydantic import Field, PrivateAttr
 
-from mushpipe import Circles, DepthSource, GraphPath, Mask, Picks, RgbdFrame, RunInfo, Sink
+from mushpipe import GraphPath, Header, RunInfo, Sink, Trace
+from mushpipe.core.errors import DependencyError, UsageError
+from mushpipe.core.transform import Transform
 
-_IMAGE = "camera/image"
-_DETECTED = (0, 200, 255)
+logger = logging.getLogger("mushpipe")
+PORT = 9876  # the SDK's own default
+PATIENCE_S = 20.0
 
 
 class RerunSink(Sink):
-    """Shows colour, depth, mask, circles and labels; saved to a file, or in a viewer."""
+    """Shows what each stage made of a frame: saved to a file, in a viewer, or for viewers to fetch.
+
+    Layers of the image, caps in space, plots and the log stand on two timelines, `frame` and
+    `capture` (sensor time). A live run shows a few images per second and the results of all frames,
+    and viewers forget the oldest data first, so that memory stays bounded.
+    """
 
     delivery: ClassVar[Literal["every", "latest"]] = "latest"
 
     save: GraphPath | None = Field(
         None, description=".rrd file to write; {recording} is the name of the input"
     )
-    spawn: bool = Field(False, description="open a viewer")
+    spawn: bool = Field(False, description="open a viewer on this machine's display")
+    connect: str | None = Field(
+        None, description="viewer to send to: rerun+http://127.0.0.1:9876/proxy"
+    )
+    serve: int | None = Field(
+        None, ge=1, le=65535, description="port on which viewers can fetch the run while it lasts"
+    )
+    host: str = Field(
+        "127.0.0.1", description="address that `serve` listens on; 0.0.0.0 lets everybody in"
+    )
+    memory: str = Field("1GB", description="what the viewer or server of `spawn` and `serve` keeps")
+    image_hz: float = Field(
+        5.0, gt=0, description="most images per second of a live run; a replay shows all"
+    )
     jpeg_quality: int = Field(85, ge=1, le=100, description="quality of the stored colour images")
+    cloud_step: int = Field(3, ge=1, description="pixels between the points of the cloud")
 
     _recording: Any = PrivateAttr(None)
+    _server: subprocess.Popen[bytes] | None = PrivateAttr(None)
+    _notes: _Notes | None = PrivateAttr(None)
+    _period_ns: int = PrivateAttr(0)
+    _next_ns: int = PrivateAttr(0)
+    _shown: tuple[list[str], float | None] | None = PrivateAttr(None)
+    _last: Header | None = PrivateAttr(None)
+    _base: Transform | None = PrivateAttr(None)
 
     def files(self, run: RunInfo) -> tuple[Path, ...]:
         """Return the file it writes."""
         return (run.path(self.save),) if self.save else ()
 
     def open(self, run: RunInfo) -> None:
-        """Create the recording and send the layout."""
+        """Open the file and the ways to viewers.
+
+        Raises:
+            UsageError: There is nothing to do, or nobody listens at `connect`.
+            DependencyError: There is no display for `spawn`, or the server does not start.
+        """
         import rerun as rr
 
-        if not (self.save or self.spawn):
-            raise ValueError("nothing to do: set 'save' to a file, or 'spawn' to true")
-        self._recording = rr.RecordingStream("mushpipe", recording_id=run.recording)
-        if self.spawn:
-            self._recording.spawn()
-        if self.save:
-            self._recording.save(str(run.path(self.save)))
-        self._recording.send_blueprint(_blueprint())
-        classes = [(0, "bed", (0, 0, 0, 0)), (1, "mushroom", (60, 220, 90, 255))]
-        for layer in ("mask", "initial"):
-            context = rr.AnnotationContext(classes)
-            self._recording.log(f"{_IMAGE}/{layer}", context, static=True)
+        from mushpipe.sinks.rerun_log import log_start
 
-    def consume(
-        self,
-        frame: RgbdFrame,
-        mask: Mask | None = None,
-        circles: Circles | None = None,
-        picks: Picks | None = None,
-    ) -> None:
+        sinks: list[Any] = [rr.FileSink(str(run.path(self.save)))] if self.save else []
+        sinks += [rr.GrpcSink(url) for url in self._viewers()]
+        if not sinks:
+            raise UsageError("nothing to do: set 'save', 'spawn', 'connect' or 'serve'")
+        self._recording = rr.RecordingStream("mushpipe", recording_id=run.recording)
+        self._recording.set_sinks(*sinks)
+        graph = run.manifest.get("graph", {})
+        self._base = _base(graph)
+        log_start(self._recording, _workspace(graph), self._base)
+        self._period_ns = round(1e9 / self.image_hz) if run.live else 0
+        self._notes = _Notes()
+        logger.addHandler(self._notes)
+
+    def _viewers(self) -> list[str]:
+        """Return the addresses to send to, after starting what is to be started there."""
+        urls = []
+        if self.connect is not None:
+            _check_reachable(self.connect)
+            urls.append(self.connect)
+        if self.spawn:
+            if not has_display():
+                raise DependencyError(
+                    "there is no display to open a viewer on: set 'save' to a file, or 'serve' to "
+                    "a port and look from another machine"
+                )
+            if not _answers("127.0.0.1", PORT):  # a viewer that is open already will do
+                _start("127.0.0.1", PORT, "--memory-limit", self.memory)
+            urls.append(f"rerun+http://127.0.0.1:{PORT}/proxy")
+        if self.serve is not None:
+            limit = ("--server-memory-limit", self.memory)
+            self._server = _start(self.host, self.serve, "--serve-grpc", *limit)
+            urls.append(f"rerun+http://{_reached_at(self.host)}:{self.serve}/proxy")
+            logger.info("look at it with: rerun %s", urls[-1])
+        return urls
+
+    def consume(self, trace: Trace) -> None:
         """Log one frame."""
         import rerun as rr
 
-        rec = self._recording
-        rec.set_time("frame", sequence=frame.header.sequence)
-        rec.set_time("capture", timestamp=np.datetime64(frame.header.stamp_ns, "ns"))
-        self._log_frame(frame)
-        if mask is not None:
-            rec.log(f"{_IMAGE}/mask", rr.SegmentationImage(mask.foreground.astype(np.uint8)))
-            if mask.initial is not None:
-                initial = rr.SegmentationImage(mask.initial.astype(np.uint8))
-                rec.log(f"{_IMAGE}/initial", initial)
-        outlines = circles if picks is None else picks
-        if outlines is not None:
-            ellipses = rr.Ellipses2D(
-                centers=outlines.center,
-                half_sizes=np.repeat(outlines.radius[:, None], 2, axis=1),
-                colors=[_DETECTED] if picks is None else _colors(picks),
-                labels=None if picks is None else _labels(picks),
-            )
-            rec.log(f"{_IMAGE}/circles", ellipses)
-        if picks is not None:
-            known = picks.source != DepthSource.MISSING
-            radii = np.nan_to_num(picks.diameter[known]) / 2
-            place = "camera" if picks.frame_id == frame.header.frame_id else picks.frame_id
-            rec.log(f"{place}/picks", rr.Points3D(picks.position[known], radii=radii))
+        from mushpipe.sinks import rerun_log
 
-    def _log_frame(self, frame: RgbdFrame) -> None:
-        import rerun as rr
+        rec, header = self._recording, trace.frame.header
+        rerun_log.set_frame(rec, header)
+        self._last = header
+        self._lay_out(trace)
+        if header.stamp_ns >= self._next_ns or not self._period_ns:
+            self._next_ns = header.stamp_ns + self._period_ns
+            rerun_log.log_images(rec, trace, self.jpeg_quality, self.cloud_step)
+        rerun_log.log_results(rec, trace, self._base)
+        self._write_notes(rr)
 
-        rec, camera = self._recording, frame.camera
-        color = rr.Image(frame.color).compress(jpeg_quality=self.jpeg_quality)
-        rec.log(f"{_IMAGE}/color", color)
-        if camera is not None:
-            pinhole = rr.Pinhole(
-                focal_length=(camera.fx, camera.fy),
-                principal_point=(camera.cx, camera.cy),
-                width=camera.width,
-                height=camera.height,
-            )
-            rec.log(_IMAGE, pinhole)
-        if frame.depth is not None:
-            known = frame.depth[frame.depth > 0]
-            reach = np.percentile(known, (1, 99)) if known.size else None
-            depth = rr.DepthImage(frame.depth, meter=1 / frame.depth_scale, depth_range=reach)
-            rec.log(f"{_IMAGE}/depth", depth)
+    def _lay_out(self, trace: Trace) -> None:
+        """Send the layout as soon as a frame shows which layers, and whether depth, there are."""
+        from mushpipe.sinks.rerun_layout import layout
+        from mushpipe.sinks.rerun_log import distance_of, layers_of, log_layers
+
+        if self._shown is not None and all(self._shown):
+            return
+        before = self._shown or ([], None)
+        shown = (before[0] or layers_of(trace), before[1] or distance_of(trace.frame))
+        if shown != self._shown:
+            self._shown = shown
+            log_layers(self._recording, shown[0], [*trace.durations_ns])
+            self._recording.send_blueprint(layout(*shown))
+
+    def _write_notes(self, rr: Any) -> None:
+        while self._notes is not None and self._notes.waiting:
+            record = self._notes.waiting.popleft()
+            level = "WARN" if record.levelname == "WARNING" else record.levelname
+            self._recording.log("log", rr.TextLog(record.getMessage(), level=level))
 
     def close(self) -> None:
-        """Finish the file."""
+        """Finish the file; a viewer that is gone by then is no failure of the run."""
+        if self._notes is not None:
+            logger.removeHandler(self._notes)
         if self._recording is not None:
-            self._recording.flush()
+            import rerun as rr
+
+            from mushpipe.sinks.rerun_log import set_frame
+
+            if self._last is not None:
+                set_frame(self._recording, self._last)  # timelines belong to a thread
+            self._write_notes(rr)
+            try:
+                self._recording.flush()
+            except RuntimeError as error:
+                logger.warning("the viewer did not take everything: %s", error)
             self._recording.disconnect()
             self._recording = None
+        if self._server is not None:
+            os.killpg(self._server.pid, signal.SIGTERM)  # the command starts a child
+            self._server.wait()
+            self._server = None
 
 
-def _labels(picks: Picks) -> list[str]:
-    """Return per pick its id, and its diameter where it is known."""
-    sizes = (f" {1000 * d:.0f} mm" if np.isfinite(d) else " size unknown" for d in picks.diameter)
-    return [f"{i}{size}" for i, size in zip(picks.id, sizes, strict=True)]
+def has_display() -> bool:
+    """Return whether a viewer can open a window here."""
+    return sys.platform != "linux" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
 
 
-def _colors(picks: Picks) -> list[tuple[int, int, int]]:
-    """Green is measured, amber estimated from neighbours, red without depth."""
-    palette = {0: (255, 70, 70), 1: (60, 220, 90), 2: (255, 190, 40)}
-    return [palette[int(source)] for source in picks.source]
+class _Notes(logging.Handler):
+    """Keeps what is logged until it can be written at a frame."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.INFO)
+        self.waiting: deque[logging.LogRecord] = deque(maxlen=1000)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.waiting.append(record)
 
 
-def _blueprint() -> Any:
-    import rerun.blueprint as rrb
+def _workspace(graph: Any) -> tuple[Any, Any] | None:
+    """Return the corners of a robot's workspace, which is in the frame of the picks."""
+    for sink in graph.get("sinks", {}).values():
+        if sink.get("workspace"):
+            return sink["workspace"]["low"], sink["workspace"]["high"]
+    return None
 
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Spatial2DView(
-                origin=_IMAGE,
-                name="Picks",
-                contents=[f"{_IMAGE}/color", f"{_IMAGE}/circles"],
-            ),
-            rrb.Vertical(
-                rrb.Spatial2DView(
-                    origin=_IMAGE, name="Mask", contents=[f"{_IMAGE}/color", f"{_IMAGE}/mask"]
-                ),
-                rrb.Spatial2DView(origin=_IMAGE, name="Depth", contents=[f"{_IMAGE}/depth"]),
-            ),
-            column_shares=[2, 1],
-        ),
-        collapse_panels=True,
+
+def _base(graph: Any) -> Transform | None:
+    """Return the pose of the camera in the robot's frame, where picks are given in that."""
+    stated = [stage.get("T_base_camera") for stage in graph.get("stages", {}).values()]
+    known = [Transform.model_validate(each) for each in stated if each]
+    return known[-1] if known else None
+
+
+def _reached_at(host: str) -> str:
+    return "127.0.0.1" if host in ("0.0.0.0", "::") else host
+
+
+def _answers(host: str, port: int) -> bool:
+    try:
+        socket.create_connection((host, port), timeout=2).close()
+    except OSError:
+        return False
+    return True
+
+
+def _check_reachable(url: str) -> None:
+    parts = urlsplit(url)
+    if not url.startswith("rerun") or not parts.hostname:
+        raise UsageError(f"connect: '{url}' is not like rerun+http://127.0.0.1:{PORT}/proxy")
+    if not _answers(parts.hostname, parts.port or PORT):
+        raise UsageError(f"connect: no viewer answers at {parts.hostname}:{parts.port or PORT}")
+
+
+def _start(host: str, port: int, *arguments: str) -> subprocess.Popen[bytes]:
+    """Start Rerun as a process of its own: the SDK's own servers always listen on 0.0.0.0.
+
+    Raises:
+        UsageError: The port is taken.
+        DependencyError: It does not come up.
+    """
+    if _answers(_reached_at(host), port):
+        raise UsageError(f"port {port} is taken: choose another, or end what listens there")
+    server = subprocess.Popen(
+        [sys.executable, "-m", "rerun", "--bind", host, "--port", str(port), *arguments],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,  # Ctrl-C is for the run, which then ends the server
     )
+    deadline = time.monotonic() + PATIENCE_S
+    while not _answers(_reached_at(host), port):
+        if server.poll() is not None or time.monotonic() > deadline:
+            os.killpg(server.pid, signal.SIGKILL)
+            raise DependencyError(f"Rerun does not start on {host}:{port}")
+        time.sleep(0.05)
+    return server

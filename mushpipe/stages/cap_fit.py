@@ -27,7 +27,7 @@ Floats = NDArray[np.float64]
 class CapFit(Stage):
     """Fits a spheroid cap to the depth in each circle: axis, apex, diameter, with sigmas.
 
-    Seven parameters are fitted to block means of the depth, along their rays; to the depth edge and
+    Eight parameters are fitted to block means of the depth, along their rays; to the depth edge and
     the circle, which touch the cap; and to what caps are like. Nearer mushrooms' circles hide what
     they cover. Where tilt cannot be seen the sigma says so. A mushroom with hardly any depth is
     ``missing`` and has no pose.

@@ -81,17 +81,9 @@ def steepest(profile: Floats, count: int, sign: float) -> tuple[float, float]:
 
 @jit
 def sample_outline(
-    gray: NDArray[np.float32],
-    rays: NDArray[np.float32],
-    ranks: NDArray[np.int16],
-    rank: int,
-    cap: Floats,
-    circle: Floats,
-    focal: float,
-    sigma: float,
-    flat: Floats,
-    out: Singles,
-) -> int:
+    gray: Singles, rays: Singles, ranks: NDArray[np.int16], rank: int, cap: Floats, circle: Floats,
+    focal: float, sigma: float, flat: Floats, out: Singles,
+) -> int:  # fmt: skip
     """Find the outline of a cap in the colour image, in 32 directions.
 
     Args:

@@ -7,7 +7,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mushpipe.core.document import parse_document
+from mushpipe.core.document import Document, parse_document, read_document
 from mushpipe.core.errors import GraphError
 from mushpipe.core.graph import compile_document
 from mushpipe.core.plugins import load_registry
@@ -47,6 +47,15 @@ def test_a_resolved_graph_compiles_to_itself(lab: Lab):
     resolved = lab.compile(GOOD).resolved()
     assert resolved["stages"]["segment"] == {"use": "threshold", "level": 1, "band": [1, 2]}
     assert lab.compile(yaml.safe_dump(resolved, sort_keys=False)).resolved() == resolved
+
+
+@pytest.mark.parametrize("path", sorted(Path("graphs").glob("*.yaml")), ids=lambda p: p.stem)
+def test_the_resolved_form_of_each_graph_here_compiles_to_itself(path: Path):
+    """Failure capsules and manifests hold graphs in this form."""
+    registry = load_registry()
+    resolved = compile_document(read_document(path), registry).resolved()
+    again = compile_document(Document("resolved", Path(), resolved), registry)
+    assert again.resolved() == resolved
 
 
 def stage(text: str) -> str:

@@ -178,7 +178,8 @@ def test_results_without_images_cannot_be_played_and_say_so(tmp_path: Path) -> N
     path = record(tmp_path / "o.mcap", [trace_of(make_frame(), a=make_circles())], frames=False)
     frames, error = drain(McapSource(path=path))
     assert frames == []
-    assert "it holds no colour images (it holds /mushpipe/a, /mushpipe/timing)" in str(error)
+    held = "/mushpipe/a, /mushpipe/a/annotations, /mushpipe/timing"
+    assert f"it holds no colour images (it holds {held})" in str(error)
 
 
 GRAPH = {
@@ -240,8 +241,11 @@ def test_running_twice_gives_the_same_bytes_at_any_speed(tmp_path: Path) -> None
         "/mushpipe/open",
         "/mushpipe/open/initial",
         "/mushpipe/detect",
+        "/mushpipe/detect/annotations",
         "/mushpipe/locate",
         "/mushpipe/pick",
+        "/mushpipe/pick/annotations",
+        "/mushpipe/pick/scene",
         "/mushpipe/timing",
     }
     for other in (second, paced):

@@ -139,8 +139,11 @@ def test_every_output_has_a_topic_of_its_own(tmp_path: Path) -> None:
         "/mushpipe/segment": "foxglove.RawImage",
         "/mushpipe/segment/initial": "foxglove.RawImage",
         "/mushpipe/detect": "mushpipe.Circles",
+        "/mushpipe/detect/annotations": "foxglove.ImageAnnotations",
         "/mushpipe/detect/mask": "foxglove.RawImage",
         "/mushpipe/pick": "mushpipe.Picks",
+        "/mushpipe/pick/annotations": "foxglove.ImageAnnotations",
+        "/mushpipe/pick/scene": "foxglove.SceneUpdate",
         "/mushpipe/timing": "mushpipe.Timing",
     }
     mask, initial = (topics[f"/mushpipe/segment{end}"][0][3] for end in ("", "/initial"))
@@ -169,9 +172,10 @@ def test_tables_are_plain_json_described_by_a_schema_in_the_file(tmp_path: Path)
     assert (body["id"], body["source"], body["flags"]) == ([7, 8], [2, 0], [2, 13])
 
 
-def test_images_may_be_left_out(tmp_path: Path) -> None:
+def test_images_and_drawings_may_be_left_out(tmp_path: Path) -> None:
     trace = trace_of(make_frame(), detect=make_circles())
-    topics = by_topic(record(tmp_path / "out.mcap", [trace], frames=False, timing=False))
+    nothing_else = {"frames": False, "timing": False, "drawings": False}
+    topics = by_topic(record(tmp_path / "out.mcap", [trace], **nothing_else))
     assert set(topics) == {"/mushpipe/detect"}
 
 

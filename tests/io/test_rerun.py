@@ -1,71 +1,49 @@
-"""What the sink `rerun` writes, read back by Rerun's own reader."""
+"""What the sink `rerun` shows of a frame, read back by Rerun's own reader."""
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-import pyarrow as pa
 import pytest
-import rerun as rr
-from rerun.chunk import RrdReader
+from scipy.spatial.transform import Rotation
 
-from mushpipe import Circles, Mask, RgbdFrame, RunInfo
+from mushpipe import Circles, Mask, Picks, RunInfo
 from mushpipe.sinks.rerun import RerunSink
-from tests.io.bags import FX, FY, PERIOD, T0, depth_pixels
-from tests.io.values import SIZE, feed, make_circles, make_frame, make_picks, no_picks
-
-IMAGE = "/camera/image"
-
-
-def show(tmp_path: Path, inputs: list[dict[str, Any]], **settings: Any) -> dict[str, Any]:
-    """Feed the sink and return what the file holds: columns by entity and component."""
-    feed(RerunSink(save=tmp_path / "out.rrd", **settings), inputs)
-    found: dict[str, dict[str, list[Any]]] = {}
-    for chunk in RrdReader(tmp_path / "out.rrd").stream():
-        batch = chunk.to_record_batch()
-        columns = found.setdefault(chunk.entity_path, {})
-        for name in batch.schema.names:
-            column = batch.column(name)
-            if pa.types.is_timestamp(column.type):
-                column = column.cast(pa.int64())
-            columns.setdefault(name, []).extend(column.to_pylist())
-    return found
-
-
-def values(found: dict[str, Any], entity: str, component: str) -> list[Any]:
-    """Return one value per row of a column, whatever archetype it belongs to."""
-    (name,) = (n for n in found[entity] if n.endswith(f":{component}"))
-    return found[entity][name]
+from tests.io.bags import FX, FY, OPTICAL, PERIOD, T0, depth_pixels
+from tests.io.rerun_file import IMAGE, read, show, unpack, values
+from tests.io.values import SIZE, make_circles, make_frame, make_picks, no_picks, trace_of
 
 
 def test_frames_stand_on_two_timelines(tmp_path: Path) -> None:
-    found = show(tmp_path, [{"frame": make_frame(i)} for i in range(3)])
+    found = show(tmp_path, [trace_of(make_frame(i)) for i in range(3)])
     color = found[f"{IMAGE}/color"]
     assert color["frame"] == [10, 11, 12]
     assert color["capture"] == [T0 + i * PERIOD for i in range(3)]
-    assert {entity for entity in found if "frame" in found[entity]} == {
-        *(IMAGE, f"{IMAGE}/color", f"{IMAGE}/depth"),
-    }
 
 
 def test_color_is_stored_as_jpeg_of_the_stated_quality(tmp_path: Path) -> None:
     red = np.zeros((24, 32, 3), np.uint8)
     red[..., 0] = 200
-    found = show(tmp_path, [{"frame": make_frame(color=red)}], jpeg_quality=95)
+    found = show(tmp_path, [trace_of(make_frame(color=red))], jpeg_quality=95)
     ((data,),) = values(found, f"{IMAGE}/color", "blob")
     decoded = cv2.imdecode(np.array(data, np.uint8), cv2.IMREAD_COLOR_RGB)
     assert np.abs(decoded.astype(int) - red).max() <= 4
 
 
-def test_depth_is_stored_native_with_its_unit(tmp_path: Path) -> None:
-    found = show(tmp_path, [{"frame": make_frame()}])
+def test_depth_is_stored_native_with_its_unit_and_its_holes_are_marked(tmp_path: Path) -> None:
+    found = show(tmp_path, [trace_of(make_frame())])
     ((data,),) = values(found, f"{IMAGE}/depth", "buffer")
     stored = np.array(data, np.uint8).view(np.uint16).reshape(24, 32)
-    np.testing.assert_array_equal(stored, depth_pixels(0, SIZE))
+    truth = depth_pixels(0, SIZE)
+    np.testing.assert_array_equal(stored, truth)
     assert values(found, f"{IMAGE}/depth", "meter") == [[8000.0]]
+    ((holes,),) = values(found, f"{IMAGE}/holes", "buffer")
+    np.testing.assert_array_equal(np.reshape(holes, (24, 32)), truth == 0)
+    (valid,) = (row for row in values(found, "/plots/depth/valid", "scalars") if row)
+    assert valid[0] == pytest.approx(100 * np.count_nonzero(truth) / truth.size)
 
 
 def test_depth_in_metres_with_gaps_is_shown(tmp_path: Path) -> None:
@@ -74,7 +52,7 @@ def test_depth_in_metres_with_gaps_is_shown(tmp_path: Path) -> None:
     for i, depth in enumerate((metres, np.zeros_like(metres))):
         folder = tmp_path / str(i)
         folder.mkdir()
-        found = show(folder, [{"frame": make_frame(depth=depth, depth_scale=1.0)}])
+        found = show(folder, [trace_of(make_frame(depth=depth, depth_scale=1.0))])
         ((data,),) = values(found, f"{IMAGE}/depth", "buffer")
         stored = np.array(data, np.uint8).view(np.float32).reshape(24, 32)
         np.testing.assert_array_equal(stored, depth)
@@ -82,89 +60,214 @@ def test_depth_in_metres_with_gaps_is_shown(tmp_path: Path) -> None:
 
 
 def test_the_pinhole_is_that_of_the_camera(tmp_path: Path) -> None:
-    found = show(tmp_path, [{"frame": make_frame()}])
+    found = show(tmp_path, [trace_of(make_frame())])
     ((matrix,),) = values(found, IMAGE, "image_from_camera")
     expected = np.array([[FX, 0, 15.5], [0, FY, 11.5], [0, 0, 1]])
     np.testing.assert_allclose(np.reshape(matrix, (3, 3)).T, expected)
     assert values(found, IMAGE, "resolution") == [[[32, 24]]]
 
 
+def test_the_cloud_has_the_place_and_colour_of_its_pixels(tmp_path: Path) -> None:
+    frame = make_frame()
+    found = show(tmp_path, [trace_of(frame)], cloud_step=5)
+    (points,) = values(found, "/camera/cloud", "positions")
+    assert frame.camera is not None
+    pixels = frame.camera.project(np.array(points))
+    u, v = np.rint(pixels).astype(int).T
+    # Row by row every fifth pixel that has depth, lifted to its depth; the lens is undone.
+    grid = [(x, y) for y in range(0, 24, 5) for x in range(0, 32, 5) if frame.depth[y, x]]  # type: ignore[index]
+    assert list(zip(u, v, strict=True)) == grid
+    np.testing.assert_allclose(pixels, grid, atol=1e-3)
+    np.testing.assert_allclose(np.array(points)[:, 2], frame.depth_m[v, u], rtol=1e-6)
+    (packed,) = values(found, "/camera/cloud", "colors")
+    np.testing.assert_array_equal([unpack(c) for c in packed], frame.color[v, u])
+
+
 def test_a_frame_of_colour_alone_is_shown(tmp_path: Path) -> None:
-    found = show(tmp_path, [{"frame": make_frame(depth=None, camera=None)}])
+    found = show(tmp_path, [trace_of(make_frame(depth=None, camera=None))])
     assert f"{IMAGE}/color" in found
-    assert f"{IMAGE}/depth" not in found
-    assert IMAGE not in found
+    assert not {f"{IMAGE}/depth", "/camera/cloud"} & set(found)
 
 
-def test_masks(tmp_path: Path) -> None:
-    foreground = np.zeros((24, 32), bool)
-    foreground[3:5, 4:9] = True
-    found = show(tmp_path, [{"frame": make_frame(), "mask": Mask(foreground, ~foreground)}])
-    for entity, expected in (("mask", foreground), ("initial", ~foreground)):
+def test_every_mask_and_every_contour_has_its_layer(tmp_path: Path) -> None:
+    first, second = np.zeros((24, 32), bool), np.zeros((24, 32), bool)
+    first[3:5, 4:9] = second[3:5, 4:6] = True
+    trace = trace_of(make_frame(), segment=Mask(first, ~first), open=Mask(second, (~first).copy()))
+    found = show(tmp_path, [trace])
+    layers = {"masks/segment": first, "masks/open": second, "initial/segment": ~first}
+    for entity, expected in layers.items():
         ((data,),) = values(found, f"{IMAGE}/{entity}", "buffer")
         np.testing.assert_array_equal(np.reshape(data, (24, 32)), expected)
+    assert "buffer" not in str(found.get(f"{IMAGE}/initial/open"))  # the same contour, once
 
 
-def colors_of(found: dict[str, Any]) -> list[tuple[int, int, int]]:
-    (packed,) = values(found, f"{IMAGE}/circles", "colors")
-    return [(c >> 24 & 255, c >> 16 & 255, c >> 8 & 255) for c in packed]
+def test_a_frame_that_a_stage_changed_has_its_layer(tmp_path: Path) -> None:
+    frame = make_frame()
+    flat = make_frame(color=np.full((24, 32, 3), 90, np.uint8))
+    found = show(tmp_path, [trace_of(frame, flatten=flat, correct=make_frame(color=frame.color))])
+    ((data,),) = values(found, f"{IMAGE}/frames/flatten", "blob")
+    decoded = cv2.imdecode(np.array(data, np.uint8), cv2.IMREAD_COLOR)
+    assert np.abs(decoded.astype(int) - 90).max() <= 2
+    assert f"{IMAGE}/frames/correct" not in found  # only its depth is another
 
 
-def test_circles_carry_the_place_size_label_and_colour_of_their_picks(tmp_path: Path) -> None:
-    inputs = {"frame": make_frame(), "circles": make_circles(), "picks": make_picks()}
-    found = show(tmp_path, [inputs])
-    entity = f"{IMAGE}/circles"
+def test_picks_carry_the_place_size_label_and_colour(tmp_path: Path) -> None:
+    found = show(tmp_path, [trace_of(make_frame(), detect=make_circles(), pick=make_picks())])
+    entity = f"{IMAGE}/picks"
     assert values(found, entity, "centers") == [[[10.25, 5.5], [20.0, 12.0]]]
     (sizes,) = values(found, entity, "half_sizes")
     np.testing.assert_allclose(sizes, [[3.5, 3.5], [1 / 3, 1 / 3]], rtol=1e-6)
-    assert values(found, entity, "labels") == [["7 40 mm", "8 size unknown"]]
-    (amber, red), (points,) = colors_of(found), values(found, "/camera/picks", "positions")
+    assert values(found, f"{IMAGE}/ids", "labels") == [["7: 40 mm", "8: size unknown"]]
+    assert values(found, f"{IMAGE}/ids", "positions") == values(found, entity, "centers")
+    (packed,) = values(found, entity, "colors")
+    amber, red = (unpack(c) for c in packed)
     assert amber[0] > amber[1] > amber[2]
     assert red[0] > 2 * max(red[1:])
     # Only a pick with a position stands in space.
-    np.testing.assert_allclose(points, [[0.1, -0.2, 0.5]], rtol=1e-6)
-    np.testing.assert_allclose(values(found, "/camera/picks", "radii"), [[0.02]], rtol=1e-6)
+    np.testing.assert_allclose(
+        values(found, "/camera/picks", "positions"), [[[0.1, -0.2, 0.5]]], rtol=1e-6
+    )
+    assert values(found, "/camera/order", "labels") == [["1"]]
+
+
+def many(n: int, frame_id: str = OPTICAL) -> Picks:
+    """Make picks in a row, 5 cm apart; each leans more."""
+    tilt = np.linspace(0, 0.5, n)
+    axis = np.column_stack([np.sin(tilt), np.zeros(n), -np.cos(tilt)])
+    x = np.arange(n) * 0.05
+    half = np.column_stack([np.zeros(n), -np.cos(tilt / 2), np.zeros(n), np.sin(tilt / 2)])
+    nan = np.full((n, 3), np.nan)
+    return Picks(
+        id=np.arange(n) + 100,
+        center=np.column_stack([x, x]),
+        radius=np.full(n, 3.0),
+        position=np.column_stack([x, 0 * x, 0 * x + 0.5]),
+        surface=np.column_stack([x, 0 * x, 0 * x + 0.5]),
+        distance=np.hypot(x, 0.5),
+        diameter=np.full(n, 0.04),
+        quaternion=half,
+        axis=axis,
+        score=np.linspace(0.1, 0.9, n),
+        sigma_position=nan,
+        sigma_diameter=nan[:, 0],
+        sigma_tilt=np.linspace(0, np.radians(20), n),
+        source=np.ones(n, np.uint8),
+        flags=np.zeros(n, np.uint32),
+        frame_id=frame_id,
+    )
+
+
+def test_caps_and_axes_stand_where_the_picks_say(tmp_path: Path) -> None:
+    picks = many(5)
+    found = show(tmp_path, [trace_of(make_frame(), pick=picks)])
+    (origins,), (vectors,) = (values(found, "/camera/axes", n) for n in ("origins", "vectors"))
+    np.testing.assert_allclose(origins, picks.position, atol=1e-6)
+    np.testing.assert_allclose(vectors, 0.02 * picks.axis, atol=1e-6)
+    (centers,), (sizes,) = (values(found, "/camera/caps", n) for n in ("centers", "half_sizes"))
+    # The top of each ellipsoid along its own axis is the apex, its width the diameter.
+    tops = np.array(centers) + np.array(sizes)[:, 2:] * picks.axis
+    np.testing.assert_allclose(tops, picks.position, atol=1e-6)
+    np.testing.assert_allclose(np.array(sizes)[:, :2], 0.02, rtol=1e-6)
+    colors = np.array([unpack(c) for c in values(found, "/camera/axes", "colors")[0]])
+    assert (np.diff(colors[:, 0]) > 0).all()  # the more uncertain, the redder
+    assert (np.diff(colors[:, 1]) < 0).all()
+    assert all(c & 255 < 128 for c in values(found, "/camera/caps", "colors")[0])  # translucent
+    assert values(found, "/camera/order", "labels") == [["1", "2", "3", "4", "5"]]
+
+
+def test_labels_of_a_crowd_are_ids_alone(tmp_path: Path) -> None:
+    found = show(tmp_path, [trace_of(make_frame(), pick=many(150))])
+    (labels,) = values(found, f"{IMAGE}/ids", "labels")
+    assert labels == [str(100 + i) for i in range(150)]
+    assert len(values(found, "/camera/order", "labels")[0]) == 20
 
 
 def test_circles_without_picks_are_shown(tmp_path: Path) -> None:
-    found = show(tmp_path, [{"frame": make_frame(), "circles": make_circles()}])
-    assert len(values(found, f"{IMAGE}/circles", "centers")[0]) == 2
-    assert len(set(colors_of(found))) == 1
+    found = show(tmp_path, [trace_of(make_frame(), detect=make_circles())])
+    assert len(values(found, f"{IMAGE}/circles/detect", "centers")[0]) == 2
 
 
 def test_nothing_found_clears_what_was_shown(tmp_path: Path) -> None:
     none = Circles(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
-    full = {"frame": make_frame(0), "circles": make_circles(), "picks": make_picks()}
-    empty = {"frame": make_frame(1), "circles": none, "picks": no_picks()}
+    full = trace_of(make_frame(0), detect=make_circles(), pick=make_picks())
+    empty = trace_of(make_frame(1), detect=none, pick=no_picks())
     found = show(tmp_path, [full, empty])
-    assert [len(row) for row in values(found, f"{IMAGE}/circles", "centers")] == [2, 0]
+    for entity in (f"{IMAGE}/circles/detect", f"{IMAGE}/picks"):
+        assert [len(row) for row in values(found, entity, "centers")] == [2, 0]
     assert [len(row) for row in values(found, "/camera/picks", "positions")] == [1, 0]
 
 
-def test_the_layout_shows_picks_mask_and_depth(tmp_path: Path) -> None:
-    show(tmp_path, [{"frame": make_frame()}])
-    reader = RrdReader(tmp_path / "out.rrd")
-    assert len(reader.recordings()) == 1
-    assert len(reader.blueprints()) == 1
+def test_counts_and_times_are_plotted(tmp_path: Path) -> None:
+    traces = [trace_of(make_frame(i), detect=make_circles(), pick=make_picks()) for i in range(2)]
+    found = show(tmp_path, traces)
+    for name, expected in (("found", 2.0), ("located", 1.0), ("oriented", 1.0)):
+        rows = [row for row in values(found, f"/plots/count/{name}", "scalars") if row]
+        assert rows == [[expected]] * 2
+    times = [row for row in values(found, "/plots/time/pick", "scalars") if row]
+    assert times == [[0.002]] * 2
 
 
-def test_a_viewer_may_be_opened_instead(monkeypatch: pytest.MonkeyPatch) -> None:
-    opened = []
-    monkeypatch.setattr(rr.RecordingStream, "spawn", lambda self: opened.append(self))
-    sink = RerunSink(spawn=True)
-    assert sink.files(RunInfo("bed", {})) == ()
-    feed(sink, [{"frame": make_frame()}])
-    assert len(opened) == 1
-
-
-def test_without_a_destination_it_refuses_to_start() -> None:
-    with pytest.raises(ValueError, match="set 'save' to a file, or 'spawn' to true"):
-        feed(RerunSink(), [])
-
-
-def test_it_takes_only_the_newest_frame_when_live_and_can_be_closed_twice(tmp_path: Path) -> None:
-    sink = RerunSink(save=tmp_path / "{recording}.rrd")
-    assert sink.delivery == "latest"
-    feed(sink, [{"frame": RgbdFrame(make_frame().header, make_frame().color)}])
+def test_warnings_stand_in_the_log_at_their_frame(tmp_path: Path) -> None:
+    sink = RerunSink(save=tmp_path / "out.rrd")
+    sink.open(RunInfo("bed", {}))
+    sink.consume(trace_of(make_frame(0), pick=make_picks()))
+    logging.getLogger("mushpipe.somewhere").warning("the lamp flickers")
+    sink.consume(trace_of(make_frame(1)))
+    logging.getLogger("mushpipe").warning("late")
     sink.close()
-    assert (tmp_path / "bed.rrd").stat().st_size > 0
+    logging.getLogger("mushpipe").warning("after the end")
+    log = read(tmp_path / "out.rrd")["/log"]
+    levels, texts = ([row[0] for row in log[f"TextLog:{n}"]] for n in ("level", "text"))
+    summary = "2 picks, 1 without depth, 1 with estimated depth, 1 without pose, 1 at the border"
+    assert sorted(zip(log["frame"], levels, texts, strict=True)) == [
+        (10, "WARN", summary),
+        (11, "WARN", "late"),
+        (11, "WARN", "the lamp flickers"),
+    ]
+
+
+def test_a_live_run_shows_few_images_and_all_results(tmp_path: Path) -> None:
+    traces = [trace_of(make_frame(i), pick=make_picks()) for i in range(31)]  # one second
+    found = show(tmp_path, traces, live=True, image_hz=5)
+    stamps = np.array(found[f"{IMAGE}/color"]["capture"])
+    assert stamps[0] == T0
+    assert 4 <= len(stamps) <= 6
+    assert (np.diff(stamps) >= 200_000_000).all()
+    assert found["/camera/cloud"]["frame"] == found[f"{IMAGE}/color"]["frame"]
+    assert len(values(found, f"{IMAGE}/picks", "centers")) == 31
+
+
+def test_the_workspace_of_a_robot_in_the_cameras_frame_is_drawn(tmp_path: Path) -> None:
+    box = {"low": [-0.2, -0.1, 0.3], "high": [0.2, 0.1, 0.7]}
+    graph = {"stages": {}, "sinks": {"robot": {"workspace": box}}}
+    found = show(tmp_path, [trace_of(make_frame())], graph=graph)
+    np.testing.assert_allclose(values(found, "/camera/workspace", "centers"), [[[0, 0, 0.5]]])
+    sizes = values(found, "/camera/workspace", "half_sizes")
+    np.testing.assert_allclose(sizes, [[[0.2, 0.1, 0.2]]], rtol=1e-6)
+
+
+def test_picks_in_the_robots_frame_stand_below_its_base(tmp_path: Path) -> None:
+    """What Rerun makes of the transform is p_base = T_base_camera p_camera."""
+    turn = Rotation.from_euler("xyz", [180, 10, 30], degrees=True)
+    stated = {"frame": "base", "translation": [0.4, -0.1, 0.9], "quaternion": [*turn.as_quat()]}
+    box = {"low": [-0.2, -0.1, 0.3], "high": [0.2, 0.1, 0.7]}
+    graph = {
+        "stages": {"pick": {"T_base_camera": stated}},
+        "sinks": {"robot": {"workspace": box}},
+    }
+    found = show(tmp_path, [trace_of(make_frame(), pick=many(3, "base"))], graph=graph)
+    for name in ("picks", "order", "caps", "axes", "workspace"):
+        assert f"/camera/base/{name}" in found
+        assert f"/camera/{name}" not in found
+    assert values(found, "/camera/base", "relation") == [[2]]  # child from parent
+    (((qx, qy, qz, qw),),) = values(found, "/camera/base", "quaternion")
+    np.testing.assert_allclose(
+        Rotation.from_quat([qx, qy, qz, qw]).as_matrix(), turn.as_matrix(), atol=1e-6
+    )
+    np.testing.assert_allclose(values(found, "/camera/base", "translation"), [[[0.4, -0.1, 0.9]]])
+
+
+def test_picks_in_a_frame_that_nobody_placed_are_not_drawn_in_space(tmp_path: Path) -> None:
+    found = show(tmp_path, [trace_of(make_frame(), pick=many(3, "elsewhere"))])
+    assert len(values(found, f"{IMAGE}/picks", "centers")[0]) == 3
+    assert not [entity for entity in found if entity.endswith(("/caps", "/axes", "/order"))]

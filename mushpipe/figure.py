@@ -1,0 +1,239 @@
+"""The figures of Baisa & Al-Diri 2022, drawn from a frame of any result recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from itertools import islice
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mushpipe.core.errors import UsageError
+from mushpipe.core.tables import Circles, Floats, Locations
+from mushpipe.core.types import Mask, Trace
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from mushpipe.stages.registration import Alignment
+
+T = TypeVar("T")
+GREEN, RED, BLUE, YELLOW = "#28c840", "#e02020", "#1440e0", "#ffd000"
+PANEL_IN = 4.6  # width of an image
+DPI = 150
+
+
+class Panel(NamedTuple):
+    """One image of a figure: its title, its pixels and what is drawn over them."""
+
+    title: str
+    image: NDArray[Any]
+    draw: Callable[[Axes], None] = lambda _: None
+
+
+def draw_stages(trace: Trace) -> Figure:
+    """Draw original, initial contour, segmentation, opening, and circles with '+' centres.
+
+    Raises:
+        UsageError: The frame has no circles.
+    """
+    color, circles = trace.frame.color, _last(trace, Circles)
+    panels = [Panel("original", color)]
+    masks = dict(_named(trace, Mask))
+    first = next(iter(masks.values()), None)
+    if first is not None and first.initial is not None:
+        initial = first.initial
+        panels.append(Panel("initial contour", color, lambda axes: _contour(axes, initial)))
+    panels += [Panel(f"mask of {name}", mask.foreground) for name, mask in masks.items()]
+    panels.append(Panel("circles", color, lambda axes: _rings(axes, circles, cross=True)))
+    return _lay_out(panels, columns=3)
+
+
+def draw_localization(trace: Trace) -> Figure:
+    """Draw depth (blue) and distance (red), m, as measured at the centres and as estimated.
+
+    The left image shows NaN where the centre has no depth, the right one what stands in for it.
+
+    Raises:
+        UsageError: The frame has no depth, no circles or no locations.
+    """
+    circles, locations = _last(trace, Circles), _last(trace, Locations)
+    frame = trace.frame
+    if frame.depth is None:
+        raise UsageError(f"frame {frame.header.sequence} has no depth to draw")
+    height, width = frame.depth.shape
+    u, v = np.rint(circles.center).astype(int).T
+    depth = frame.depth_m[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)].astype(np.float64)
+    distance = np.full(len(circles), np.nan)
+    if frame.camera is not None:
+        points = frame.camera.deproject(circles.center, depth)
+        distance = np.linalg.norm(points, axis=1)
+    pairs = (
+        ("depth (blue) and distance (red) at the centres, m", depth, distance),
+        ("estimated where there is none", locations.position[:, 2], locations.distance),
+    )
+    panels = [
+        Panel(title, frame.color, partial(_pairs, circles=circles, depth=z, distance=d))
+        for title, z, d in pairs
+    ]
+    return _lay_out(panels, columns=2, scale=1.7)
+
+
+def draw_diameter(trace: Trace) -> Figure:
+    """Draw the diameters, mm, at the centres of the circles.
+
+    Raises:
+        UsageError: The frame has no circles or no locations.
+    """
+    circles, locations = _last(trace, Circles), _last(trace, Locations)
+
+    def draw(axes: Axes) -> None:
+        _rings(axes, circles)
+        for (x, y), diameter in zip(circles.center, 1e3 * locations.diameter, strict=True):
+            _text(axes, x, y, f"{diameter:.0f}" if np.isfinite(diameter) else "NaN", RED)
+
+    return _lay_out([Panel("diameter, mm", trace.frame.color, draw)], columns=1, scale=1.9)
+
+
+def draw_pose(trace: Trace, settings: Mapping[str, Any], most: int = 3) -> Figure:
+    """Draw the model (red) and the sample (blue) before and after registration, seen from the side.
+
+    Args:
+        trace: The frame.
+        settings: Of the stage `registration`, which is run anew on the best circles.
+        most: How many mushrooms.
+
+    Raises:
+        UsageError: The frame has no circles, no locations, or no mushroom with enough depth.
+        DependencyError: open3d or a library of the system is missing.
+    """
+    from mushpipe.stages.registration import Registration
+
+    circles, locations = _last(trace, Circles), _last(trace, Locations)
+    stage = Registration.model_validate(dict(settings))
+    best = np.argsort(-circles.score, kind="stable")
+    tries = (stage.align(trace.frame, circles, locations, int(row), 0) for row in best)
+    pairs = zip(best, tries, strict=True)
+    found = list(islice((pair for pair in pairs if pair[1] is not None), most))
+    if not found:
+        raise UsageError(f"frame {trace.frame.header.sequence}: no mushroom has enough depth")
+    return _lay_out_clouds([alignment for _, alignment in found if alignment is not None])
+
+
+KINDS: dict[str, Callable[[Trace], Figure]] = {
+    "stages": draw_stages,
+    "localization": draw_localization,
+    "diameter": draw_diameter,
+}
+
+
+def _named(trace: Trace, kind: type[T]) -> Iterator[tuple[str, T]]:
+    for stage, values in trace.outputs.items():
+        for value in values:
+            if isinstance(value, kind):
+                yield stage, value
+
+
+def _last(trace: Trace, kind: type[T]) -> T:
+    found = [value for _, value in _named(trace, kind)]
+    if not found:
+        raise UsageError(
+            f"frame {trace.frame.header.sequence} has no {kind.__name__}: the graph that wrote the "
+            "results has no stage that makes them, or the frame failed"
+        )
+    return found[-1]
+
+
+def _lay_out(panels: list[Panel], columns: int, scale: float = 1.0) -> Figure:
+    from matplotlib.figure import Figure
+
+    rows = -(-len(panels) // columns)
+    height, width = panels[0].image.shape[:2]
+    size = PANEL_IN * scale
+    figure = Figure(figsize=(columns * size, rows * (size * height / width + 0.3)), dpi=DPI)
+    figure.set_layout_engine("constrained", w_pad=0.03, h_pad=0.03)
+    places = list(np.ravel(figure.subplots(rows, columns)))
+    for letter, axes, panel in zip("abcdefghijkl", places, panels, strict=False):
+        axes.imshow(panel.image, cmap="gray", interpolation="nearest")
+        label = f"({letter}) " if len(panels) > 1 else ""
+        axes.set_title(f"{label}{panel.title}", fontsize=10)
+        axes.set_autoscale_on(False)  # a circle over the border makes no panel larger
+        panel.draw(axes)
+    for axes in places:
+        axes.set_axis_off()
+    return figure
+
+
+def _lay_out_clouds(alignments: list[Alignment]) -> Figure:
+    from matplotlib.figure import Figure
+
+    n = len(alignments)
+    figure = Figure(figsize=(0.75 * PANEL_IN * n, 1.5 * PANEL_IN), dpi=DPI, layout="constrained")
+    panels = figure.subplots(2, n, subplot_kw={"projection": "3d"}, squeeze=False)
+    for column, alignment in enumerate(alignments):
+        clouds = (alignment.before, alignment.after)
+        middle = alignment.sample.mean(axis=0)
+        reach = 1e3 * max(np.abs(cloud - middle).max() for cloud in clouds)
+        for row, (model, when) in enumerate(zip(clouds, ("before", "after"), strict=True)):
+            axes = panels[row, column]
+            for cloud, color, size, alpha in (
+                (model, RED, 2, 0.35),
+                (alignment.sample, BLUE, 5, 1.0),
+            ):
+                x, y, z = 1e3 * (cloud - middle).T
+                axes.scatter(x, y, z, s=size, color=color, alpha=alpha, depthshade=False)
+            # z of the optical frame points down, onto the bed
+            axes.set(xlim=(-reach, reach), ylim=(-reach, reach), zlim=(reach, -reach))
+            for name in "xyz":
+                getattr(axes, f"set_{name}label")(f"{name}, mm", fontsize=7, labelpad=-6)
+            axes.view_init(elev=12, azim=-60)
+            axes.tick_params(labelsize=6, pad=-3)
+            axes.set_box_aspect((1, 1, 1), zoom=0.95)
+            axes.set_title(f"({'ab'[row]}{column + 1}) {when}", fontsize=9)
+    return figure
+
+
+def _contour(axes: Axes, mask: NDArray[np.bool_]) -> None:
+    axes.contour(mask, levels=[0.5], colors=GREEN, linewidths=0.9)
+
+
+def _rings(axes: Axes, circles: Circles, cross: bool = False) -> None:
+    from matplotlib.collections import EllipseCollection
+
+    size = 2 * circles.radius
+    axes.add_collection(
+        EllipseCollection(
+            size,
+            size,
+            np.zeros_like(size),
+            units="xy",
+            offsets=circles.center,
+            offset_transform=axes.transData,
+            facecolors="none",
+            edgecolors=GREEN,
+            linewidths=1.1,
+        )
+    )
+    if cross:
+        axes.plot(*circles.center.T, "+", color=RED, ms=5, mew=0.9)
+
+
+def _pairs(axes: Axes, circles: Circles, depth: Floats, distance: Floats) -> None:
+    _rings(axes, circles)
+    for (x, y), r, z, d in zip(circles.center, circles.radius, depth, distance, strict=True):
+        _text(axes, x, y - 0.32 * min(r, 18), _metres(z), BLUE)
+        _text(axes, x, y + 0.32 * min(r, 18), _metres(d), RED)
+
+
+def _metres(value: float) -> str:
+    return f"{value:.3f}" if np.isfinite(value) else "NaN"
+
+
+def _text(axes: Axes, x: float, y: float, text: str, color: str) -> None:
+    from matplotlib.patheffects import withStroke
+
+    outline = [withStroke(linewidth=1.6, foreground="white")]
+    axes.text(x, y, text, color=color, fontsize=6, ha="center", va="center", path_effects=outline)

@@ -1,0 +1,51 @@
+"""A trace as messages: what the sinks `mcap` and `foxglove` write, topic by topic."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from typing import Any
+
+from mushpipe import Trace
+from mushpipe.core import wire
+from mushpipe.core.scene import drawings
+
+logger = logging.getLogger("mushpipe")
+Published = tuple[str, wire.Message]
+
+
+def result_messages(trace: Trace, unknown: set[type], drawn: bool) -> Iterator[Published]:
+    """Yield topic and message of every stage's output, in graph order.
+
+    Args:
+        trace: The frame.
+        unknown: Types without a wire form, filled here; each is warned of once.
+        drawn: Whether circles and picks come with their drawings for viewers as well.
+    """
+    for stage in trace.durations_ns:
+        values = trace.outputs[stage]
+        for value in values:
+            encoder = wire.encoder_of(type(value))
+            if encoder is None:
+                _warn(stage, value, unknown)
+                continue
+            # Several outputs of one stage need several topics; the first keeps the stage's own.
+            own = "" if value is values[0] else f"/{type(value).__name__.lower()}"
+            topic = f"{wire.RESULT_PREFIX}{stage}{own}"
+            for message in encoder(value, trace.frame.header):
+                yield topic + message.suffix, message
+            for message in drawings(value, trace.frame.header) if drawn else ():
+                yield topic + message.suffix, message
+
+
+def timing_message(trace: Trace) -> Published:
+    """Return the message with the time each stage took."""
+    content = {"stages_ns": dict(trace.durations_ns)}
+    return wire.TIMING_TOPIC, wire.json_message(wire.TIMING, trace.frame.header, content)
+
+
+def _warn(stage: str, value: Any, unknown: set[type]) -> None:
+    if type(value) not in unknown:
+        unknown.add(type(value))
+        name = type(value).__name__
+        logger.warning("%s is not recorded: %s is not a Columns type", stage, name)

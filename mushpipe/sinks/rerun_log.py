@@ -1,0 +1,267 @@
+"""What is written to Rerun of one frame: images, results in the image and in space, plots, log."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mushpipe import Camera, Circles, Header, Mask, PickFlag, Picks, RgbdFrame, Trace
+from mushpipe.core.scene import CYAN, DOME, GREEN, SOURCE_COLORS, in_order, labels, posed, tints
+from mushpipe.core.transform import Transform
+from mushpipe.sinks import rerun_layout as at
+
+FIRST = 20  # picks whose place in the order is written beside them
+_WHEEL = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (213, 94, 0),
+          (204, 121, 167), (150, 150, 255), (190, 190, 190))  # fmt: skip
+
+
+def results(trace: Trace, kind: type) -> Iterator[tuple[str, Any]]:
+    """Yield stage and value of what the stages put out of one type."""
+    for stage in trace.outputs:
+        for value in trace.outputs[stage]:
+            if isinstance(value, kind) and value is not trace.frame:
+                yield stage, value
+
+
+def masks(trace: Trace) -> dict[str, NDArray[np.bool_]]:
+    """Return masks by entity: each stage's, and each contour that one started from, once."""
+    layers: dict[str, NDArray[np.bool_]] = {}
+    for stage, mask in results(trace, Mask):
+        known = any(mask.initial is layer for layer in layers.values())
+        if mask.initial is not None and not known:
+            same = (np.array_equal(mask.initial, layer) for layer in layers.values())
+            if not any(same):
+                layers[f"{at.INITIAL}/{stage}"] = mask.initial
+        layers[f"{at.MASKS}/{stage}"] = mask.foreground
+    return layers
+
+
+def changed(trace: Trace) -> dict[str, RgbdFrame]:
+    """Return the frames whose colour a stage changed, by entity."""
+    color = trace.frame.color
+    return {
+        f"{at.FRAMES}/{stage}": frame
+        for stage, frame in results(trace, RgbdFrame)
+        if frame.color is not color and stage in trace.durations_ns
+    }
+
+
+def distance_of(frame: RgbdFrame) -> float | None:
+    """Return how far the bed is, m; None where there is no depth."""
+    known = frame.depth_m[np.isfinite(frame.depth_m)]
+    return float(np.median(known)) if known.size else None
+
+
+def layers_of(trace: Trace) -> list[str]:
+    """Return the layers of the image that this frame has, in drawing order."""
+    circles = [f"{at.CIRCLES}/{stage}" for stage, _ in results(trace, Circles)]
+    picks = [at.PICKS, at.IDS] if any(results(trace, Picks)) else []
+    return [*changed(trace), *masks(trace), *circles, *picks]
+
+
+def log_layers(rec: Any, layers: Sequence[str], stages: Sequence[str]) -> None:
+    """Log the colours of masks, initial contours, holes, and of the stages in the plot."""
+    import rerun as rr
+
+    for number, stage in enumerate(stages):
+        _draw_series(rec, f"{at.TIMES}/{stage}", _WHEEL[number % len(_WHEEL)])
+
+    styles = {
+        at.MASKS: ("mushroom", (70, 150, 255, 255)),
+        at.INITIAL: ("initial", (255, 150, 30, 255)),
+        at.HOLES: ("no depth", (255, 40, 40, 255)),
+    }
+    for entity in (*layers, at.HOLES):
+        for prefix, style in styles.items():
+            if entity.startswith(prefix):
+                context = rr.AnnotationContext([(0, "", (0, 0, 0, 0)), (1, *style)])
+                rec.log(entity, context, static=True)
+
+
+def log_start(rec: Any, box: tuple[Any, Any] | None, base: Transform | None) -> None:
+    """Log what holds for the whole run: directions, names, workspace (m), T_base_camera."""
+    import rerun as rr
+
+    # Seen from above: x to the right, y (down in the image) towards the viewer, z down.
+    rec.log("camera", rr.ViewCoordinates.RBD, static=True)
+    names = {"found": (200, 200, 200), "located": GREEN, "oriented": (80, 160, 255)}
+    for name, color in names.items():
+        _draw_series(rec, f"{at.COUNTS}/{name}", color)
+    _draw_series(rec, f"{at.VALIDITY}/valid", (255, 120, 200))
+    if box is not None:
+        low, high = np.array(box)
+        shown = rr.Boxes3D(
+            mins=[low], sizes=[high - low], colors=(255, 255, 255), labels=["workspace"]
+        )
+        rec.log(f"{'camera' if base is None else at.BASE}/{at.WORKSPACE}", shown, static=True)
+    if base is not None:  # T_base_camera takes what is below the camera to what is below the base
+        pose = rr.Transform3D(
+            translation=base.translation,
+            quaternion=rr.Quaternion(xyzw=base.quaternion),
+            relation=rr.TransformRelation.ChildFromParent,
+        )
+        rec.log(at.BASE, pose, static=True)
+
+
+def _draw_series(rec: Any, entity: str, color: tuple[int, int, int]) -> None:
+    """Draw a series as a line with dots, so that a single frame shows as well."""
+    import rerun as rr
+
+    rec.log(entity, rr.SeriesLines(colors=color), static=True)
+    rec.log(entity, rr.SeriesPoints(colors=color, marker_sizes=3), static=True)
+
+
+def log_images(rec: Any, trace: Trace, jpeg_quality: int, cloud_step: int) -> None:
+    """Log what takes room: colour, depth with its holes, masks and the coloured cloud."""
+    import rerun as rr
+
+    frame = trace.frame
+    pictures = {at.COLOR: frame} | changed(trace)
+    for order, (entity, picture) in enumerate(pictures.items()):
+        image = rr.Image(picture.color, draw_order=order).compress(jpeg_quality=jpeg_quality)
+        rec.log(entity, image)
+    for order, (entity, mask) in enumerate(masks(trace).items()):
+        pixels = mask.view(np.uint8)
+        rec.log(entity, rr.SegmentationImage(pixels, opacity=0.3, draw_order=10 + order))
+    if frame.camera is not None:
+        pinhole = rr.Pinhole(
+            focal_length=(frame.camera.fx, frame.camera.fy),
+            principal_point=(frame.camera.cx, frame.camera.cy),
+            width=frame.camera.width,
+            height=frame.camera.height,
+            image_plane_distance=distance_of(frame),
+        )
+        rec.log(at.IMAGE, pinhole)
+    if frame.depth is not None:
+        _log_depth(rec, frame)
+        if frame.camera is not None:
+            _log_cloud(rec, frame, frame.camera, cloud_step)
+
+
+def _log_depth(rec: Any, frame: RgbdFrame) -> None:
+    import rerun as rr
+
+    depth = frame.depth_m
+    missing = np.isnan(depth)
+    few = depth[::4, ::4]
+    known = few[np.isfinite(few)] / frame.depth_scale
+    reach = np.percentile(known, (1, 99)) if known.size else None
+    image = rr.DepthImage(
+        frame.depth, meter=1 / frame.depth_scale, depth_range=reach, colormap="viridis"
+    )
+    rec.log(at.DEPTH, image)
+    rec.log(at.HOLES, rr.SegmentationImage(missing.view(np.uint8), opacity=1.0))
+    rec.log(f"{at.VALIDITY}/valid", rr.Scalars(100 * (1 - missing.mean())))
+
+
+def _log_cloud(rec: Any, frame: RgbdFrame, camera: Camera, step: int) -> None:
+    import rerun as rr
+
+    from mushpipe.stages.upright import pixel_rays
+
+    every = np.s_[::step, ::step]
+    depth, rays = frame.depth_m[every], pixel_rays(camera)[every]
+    known = np.isfinite(depth) & (np.abs(rays) < 1e3).all(axis=2)
+    z = depth[known][:, None]
+    points = np.hstack([rays[known] * z, z])
+    radii = 0.6 * step * float(np.median(z)) / camera.fx if len(z) else None
+    rec.log(at.CLOUD, rr.Points3D(points, colors=frame.color[every][known], radii=radii))
+
+
+def log_results(rec: Any, trace: Trace, base: Transform | None) -> None:
+    """Log circles, picks in the image and in space, counts, times, and the frame's warnings."""
+    import rerun as rr
+
+    for stage, circles in results(trace, Circles):
+        rec.log(f"{at.CIRCLES}/{stage}", _rings(circles, colors=CYAN))
+    for stage, duration in trace.durations_ns.items():
+        rec.log(f"{at.TIMES}/{stage}", rr.Scalars(duration / 1e6))
+    picks = next((value for _, value in reversed([*results(trace, Picks)])), None)
+    if picks is not None:
+        _log_picks(rec, picks)
+        if picks.frame_id in ("", trace.frame.header.frame_id):
+            _log_space(rec, picks, "camera")
+        elif base is not None and picks.frame_id == base.frame:
+            _log_space(rec, picks, at.BASE)  # elsewhere nobody knows how they lie to the camera
+
+
+def _rings(table: Circles | Picks, **style: Any) -> Any:
+    import rerun as rr
+
+    sizes = np.repeat(table.radius[:, None], 2, axis=1)
+    return rr.Ellipses2D(centers=table.center, half_sizes=sizes, draw_order=30, **style)
+
+
+def _log_picks(rec: Any, picks: Picks) -> None:
+    import rerun as rr
+
+    rec.log(at.PICKS, _rings(picks, colors=SOURCE_COLORS[picks.source]))
+    ids = rr.Points2D(
+        picks.center, radii=0.5, colors=(255, 255, 255), labels=labels(picks),
+        show_labels=True, draw_order=40,
+    )  # fmt: skip
+    rec.log(at.IDS, ids)
+    located = in_order(picks)
+    counts = {"found": len(picks), "located": len(located), "oriented": len(posed(picks, located))}
+    for name, count in counts.items():
+        rec.log(f"{at.COUNTS}/{name}", rr.Scalars(float(count)))
+    text, level = _summary(picks)
+    rec.log(at.LOG, rr.TextLog(text, level=level))
+
+
+def _log_space(rec: Any, picks: Picks, place: str) -> None:
+    """Log picks, their order and their caps below the entity whose frame they are in."""
+    import rerun as rr
+
+    located = in_order(picks)
+    points, colors = picks.position[located], SOURCE_COLORS[picks.source[located]]
+    rec.log(f"{place}/{at.TARGETS}", rr.Points3D(points, radii=0.002, colors=colors))
+    order = [f"{i + 1}" for i in range(min(len(located), FIRST))]
+    first = rr.Points3D(points[:FIRST], radii=0.003, colors=(255, 255, 255), labels=order)
+    rec.log(f"{place}/{at.ORDER}", first)
+    _log_caps(rec, picks, posed(picks, located), place)
+
+
+def _log_caps(rec: Any, picks: Picks, rows: NDArray[np.intp], place: str) -> None:
+    import rerun as rr
+
+    radius, axis, apex = picks.diameter[rows] / 2, picks.axis[rows], picks.position[rows]
+    colors = tints(picks.sigma_tilt[rows])
+    caps = rr.Ellipsoids3D(
+        centers=apex - DOME * radius[:, None] * axis,
+        half_sizes=radius[:, None] * (1, 1, DOME),
+        quaternions=picks.quaternion[rows],
+        colors=np.column_stack([colors, np.full(len(rows), 90, np.uint8)]),
+        fill_mode="solid",
+    )
+    rec.log(f"{place}/{at.CAPS}", caps)
+    arrows = rr.Arrows3D(origins=apex, vectors=radius[:, None] * axis, colors=colors, radii=0.0012)
+    rec.log(f"{place}/{at.AXES}", arrows)
+
+
+_WORDS = {
+    PickFlag.DEPTH_MISSING: "without depth",
+    PickFlag.DEPTH_ESTIMATED: "with estimated depth",
+    PickFlag.POSE_UNKNOWN: "without pose",
+    PickFlag.AT_BORDER: "at the border",
+    PickFlag.OCCLUDED: "partly hidden",
+    PickFlag.TILT_UNOBSERVABLE: "with an unsure tilt",
+    PickFlag.TOO_CLOSE_TO_NEIGHBOUR: "too close to a neighbour",
+}
+
+
+def _summary(picks: Picks) -> tuple[str, str]:
+    """Return the picks of a frame in words, and the level: a warning where some lack depth."""
+    counts = {flag: int(np.count_nonzero(picks.flags & np.uint32(flag))) for flag in _WORDS}
+    parts = [f"{count} {_WORDS[flag]}" for flag, count in counts.items() if count]
+    text = ", ".join([f"{len(picks)} picks", *parts])
+    return text, "WARN" if counts[PickFlag.DEPTH_MISSING] else "INFO"
+
+
+def set_frame(rec: Any, header: Header) -> None:
+    """Put what follows at a frame, on both timelines."""
+    rec.set_time("frame", sequence=header.sequence)
+    rec.set_time("capture", timestamp=np.datetime64(header.stamp_ns, "ns"))

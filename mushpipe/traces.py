@@ -1,0 +1,150 @@
+"""A result recording as it was run: each frame again, with what every stage made of it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import orjson
+from mcap_protobuf.decoder import DecoderFactory
+
+from mushpipe.core.errors import InputError, UsageError
+from mushpipe.core.recording import MANIFEST, Raw, RecordingReader
+from mushpipe.core.types import Mask, RgbdFrame, Trace
+from mushpipe.core.wire import COLOR_TOPIC, RESULT_PREFIX, TABLES, TIMING_TOPIC, decode_table
+
+
+def read_manifest(path: Path) -> dict[str, Any]:
+    """Return what the run that wrote a recording was made of; empty where it does not say."""
+    stored = RecordingReader(path).index().metadata.get(MANIFEST, {})
+    manifest: dict[str, Any] = json.loads(stored.get("json", "{}"))
+    return manifest
+
+
+def source_recording(results: Path, manifest: Mapping[str, Any]) -> Path | None:
+    """Return the recording that results were made from, where it is still to be found.
+
+    It counts only with the SHA-256 that the manifest states.
+    """
+    source = Path(str(manifest.get("graph", {}).get("source", {}).get("path", "")))
+    stated = (manifest.get("recordings") or [{}])[0]
+    for path in (source, results.parent / source, results.parent / source.name):
+        if path.is_file() and _sha256(path) == stated.get("sha256"):
+            return path
+    return None
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def has_results(path: Path) -> bool:
+    """Return whether a recording holds what stages put out."""
+    topics = RecordingReader(path).index().channels
+    return any(t.startswith(RESULT_PREFIX) and t != TIMING_TOPIC for t in topics)
+
+
+def read_traces(path: Path) -> Iterator[Trace]:
+    """Yield every frame of a recording with what the stages made of it, in order.
+
+    The images are those in the file or else those of the recording it was made from. A recording
+    without results yields its frames alone; so does a frame that no stage answered.
+
+    Raises:
+        UsageError: The images are not to be found.
+        InputError: After the last good frame: one of the two files is damaged.
+    """
+    from mushpipe.sources.mcap import McapSource
+
+    manifest = read_manifest(path)
+    images = path
+    if COLOR_TOPIC not in RecordingReader(path).index().channels and has_results(path):
+        found = source_recording(path, manifest)
+        if found is None:
+            stated = (manifest.get("recordings") or [{"file": "its recording"}])[0]["file"]
+            raise UsageError(
+                f"{path} holds no images, and {stated} is neither at its old place nor beside it"
+            )
+        images = found
+    order = list(manifest.get("graph", {}).get("stages", {}))
+    reader = RecordingReader(path)
+    groups = _groups(reader)
+    stamp, messages = next(groups, (None, []))
+    for frame in McapSource(path=images).frames():
+        trace = Trace(frame, {}, {})
+        if frame.header.stamp_ns == stamp:
+            trace = _trace(frame, messages, order)
+            stamp, messages = next(groups, (None, []))
+        yield trace
+    if reader.damage:
+        raise InputError(f"{path} is damaged: {'; '.join(reader.damage)}")
+
+
+def read_trace(path: Path, sequence: int) -> Trace:
+    """Return the trace of the frame of that number.
+
+    Raises:
+        UsageError: There is no such frame, or the images are not to be found.
+        InputError: The file is damaged before that frame.
+    """
+    seen = []
+    for trace in read_traces(path):
+        if trace.frame.header.sequence == sequence:
+            return trace
+        seen.append(trace.frame.header.sequence)
+    raise UsageError(f"{path}: there is no frame {sequence}; it holds {seen[0]} to {seen[-1]}")
+
+
+def _groups(reader: RecordingReader) -> Iterator[tuple[int, list[Raw]]]:
+    topics = {t for t in reader.index().channels if t.startswith(RESULT_PREFIX)}
+    if topics:
+        for stamp, group in groupby(reader.messages(topics), lambda raw: raw.message.publish_time):
+            yield stamp, list(group)
+
+
+def _trace(frame: RgbdFrame, messages: list[Raw], order: list[str]) -> Trace:
+    """Put the messages of one frame together again."""
+    outputs: dict[str, tuple[Any, ...]] = dict.fromkeys(order, ())
+    durations: dict[str, int] = {}
+    images: dict[str, dict[str, Any]] = {}
+    for raw in messages:
+        stage, _, part = raw.channel.topic.removeprefix(RESULT_PREFIX).partition("/")
+        schema = raw.schema.name if raw.schema else ""
+        if raw.channel.topic == TIMING_TOPIC:
+            durations = orjson.loads(raw.message.data)["stages_ns"]
+        elif schema in TABLES:
+            decoded = decode_table(schema, raw.message.data)
+            outputs[stage] = (*outputs.get(stage, ()), decoded.table if decoded else None)
+        elif schema == "foxglove.RawImage" and (image := _image(raw)) is not None:
+            images.setdefault(stage, {})[part] = image
+    for stage, parts in images.items():
+        outputs[stage] = (_of_images(frame, parts), *outputs.get(stage, ()))
+    return Trace(frame, {stage: values for stage, values in outputs.items() if values}, durations)
+
+
+def _image(raw: Raw) -> Any:
+    from mushpipe.sources.images import decode_color, decode_depth
+
+    decoder = DecoderFactory().decoder_for(raw.channel.message_encoding, raw.schema)
+    if decoder is None:
+        raise InputError(f"{raw.channel.topic}: {raw.channel.message_encoding} cannot be decoded")
+    message = decoder(raw.message.data)
+    if message.encoding in ("rgb8", "mono8"):
+        return decode_color(message)
+    scale = raw.channel.metadata.get("depth_scale")
+    return None if scale is None else decode_depth(message, float(scale))
+
+
+def _of_images(frame: RgbdFrame, parts: Mapping[str, Any]) -> Mask | RgbdFrame:
+    """Return the mask, or the changed frame, that a stage's images are."""
+    if "color" in parts:
+        depth, scale = parts.get("depth", (None, frame.depth_scale))
+        return replace(frame, color=parts["color"], depth=depth, depth_scale=scale)
+    masks = {name: pixels[..., 0] > 0 for name, pixels in parts.items()}
+    return Mask(masks[""], masks.get("initial"))

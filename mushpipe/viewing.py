@@ -1,0 +1,106 @@
+"""The verbs `mushpipe figure` and `mushpipe view`; everything heavy is imported when they run."""
+
+from __future__ import annotations
+
+import threading
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from mushpipe.sinks.rerun import RerunSink
+
+
+class FigureKind(StrEnum):
+    """The figures of the paper."""
+
+    stages = "stages"
+    localization = "localization"
+    diameter = "diameter"
+    pose = "pose"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verbs to the program."""
+    app.command()(figure)
+    app.command()(view)
+
+
+def figure(
+    results: Annotated[Path, typer.Argument(help="recording written by a sink mcap")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="image to write: .png .jpg .pdf .svg")],
+    kind: Annotated[FigureKind, typer.Option(help="which figure")] = FigureKind.stages,
+    frame: Annotated[int, typer.Option(help="number of the frame")] = 0,
+) -> None:
+    """Draw a figure of the paper from a frame of a result recording."""
+    from mushpipe.console import set_up_logging
+    from mushpipe.core.errors import UsageError
+    from mushpipe.figure import KINDS, draw_pose
+    from mushpipe.traces import read_manifest, read_trace
+
+    set_up_logging(False)
+    trace = read_trace(results, frame)
+    if kind is FigureKind.pose:
+        graph = read_manifest(results).get("graph", {})
+        stages = [s for s in graph.get("stages", {}).values() if s["use"] == "registration"]
+        settings = {k: v for s in stages[:1] for k, v in s.items() if k not in ("use", "inputs")}
+        drawn = draw_pose(trace, settings)
+    else:
+        drawn = KINDS[kind](trace)
+    try:
+        drawn.savefig(out)
+    except (OSError, ValueError) as error:  # no such folder; a suffix matplotlib does not know
+        raise UsageError(f"{out}: {error}") from error
+
+
+def view(
+    file: Annotated[Path, typer.Argument(help="recording, or results written by a sink mcap")],
+    save: Annotated[Path | None, typer.Option(help="write an .rrd file, open no window")] = None,
+    serve: Annotated[
+        int | None, typer.Option(metavar="PORT", help="let viewers fetch it, until Ctrl-C")
+    ] = None,
+) -> None:
+    """Open a recording or results in the Rerun viewer."""
+    from mushpipe.console import interruptible, set_up_logging
+    from mushpipe.core.errors import DependencyError
+    from mushpipe.sinks.rerun import RerunSink, has_display
+
+    set_up_logging(False)
+    spawn = save is None and serve is None
+    if spawn and not has_display():
+        raise DependencyError(
+            f"there is no display. mushpipe view {file} --save out.rrd writes a file for the "
+            f"command 'rerun' elsewhere; --serve 9876 lets viewers fetch it from this machine "
+            "(through ssh -L 9876:localhost:9876, say: rerun rerun+http://127.0.0.1:9876/proxy)"
+        )
+    stop = threading.Event()
+    with interruptible(stop):
+        sink = RerunSink(save=save, spawn=spawn, serve=serve)
+        _play(file, sink, stop)
+        if serve is not None:
+            stop.wait()
+        sink.close()
+
+
+def _play(file: Path, sink: RerunSink, stop: threading.Event) -> None:
+    from mushpipe.console import progress_bar
+    from mushpipe.core.report import RunReport
+    from mushpipe.core.stage import RunInfo
+    from mushpipe.traces import read_manifest, read_traces
+
+    report = RunReport()
+    sink.open(RunInfo(file.stem, read_manifest(file)))
+    with progress_bar() as show:
+        try:
+            for trace in read_traces(file):
+                if stop.is_set():
+                    return
+                sink.consume(trace)
+                report.processed += 1
+                if show is not None:
+                    show(report)
+        except BaseException:  # what could be read is shown all the same
+            sink.close()
+            raise

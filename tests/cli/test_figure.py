@@ -1,0 +1,152 @@
+"""The figures of the paper: what they show, against what was recorded."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from mushpipe import Camera, Circles, DepthSource, Locations, Mask, Trace
+from mushpipe.cli import app
+from mushpipe.core.errors import DependencyError, UsageError
+from mushpipe.core.libraries import import_open3d
+from mushpipe.figure import BLUE, RED, draw_diameter, draw_localization, draw_pose, draw_stages
+from tests.io.values import make_frame, record, trace_of
+
+NAN = float("nan")
+
+try:
+    import_open3d()
+    reason = ""
+except DependencyError as error:
+    reason = str(error)
+needs_open3d = pytest.mark.skipif(bool(reason), reason=reason)
+
+
+def scene() -> Trace:
+    """Two mushrooms, the second with a hole in the depth at its centre."""
+    depth = np.full((24, 32), 4000, np.uint16)  # 0.5 m
+    depth[11:14, 19:22] = 0
+    frame = make_frame(0, depth=depth)
+    camera = frame.camera
+    assert camera is not None
+    circles = Circles(np.array([[10.0, 5.0], [20.0, 12.0]]), np.array([4.0, 5.0]), np.ones(2))
+    position = camera.deproject(circles.center, np.array([0.5, 0.5]))
+    locations = Locations(
+        position=position,
+        distance=np.linalg.norm(position, axis=1),
+        diameter=np.array([0.0412, NAN]),
+        source=np.array([DepthSource.MEASURED, DepthSource.NEIGHBOURS]),
+        sigma_position=np.full((2, 3), NAN),
+        sigma_diameter=np.full(2, NAN),
+    )
+    mask = np.zeros((24, 32), bool)
+    mask[4:9, 4:14] = True
+    return trace_of(
+        frame, segment=Mask(mask, ~mask), open=Mask(mask), detect=circles, locate=locations
+    )
+
+
+def texts(axes: object, color: str) -> list[str]:
+    return [t.get_text() for t in axes.texts if t.get_color() == color]  # type: ignore[attr-defined]
+
+
+def test_stages_show_each_step_and_a_cross_at_each_centre() -> None:
+    figure = draw_stages(scene())
+    titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
+    assert titles == [
+        "(a) original",
+        "(b) initial contour",
+        "(c) mask of segment",
+        "(d) mask of open",
+        "(e) circles",
+    ]
+    circles = figure.axes[4]
+    (crosses,) = (line for line in circles.lines if line.get_marker() == "+")
+    np.testing.assert_array_equal(crosses.get_xydata(), [[10, 5], [20, 12]])
+    assert figure.axes[2].images[0].get_array().sum() == 50
+    # Nothing upside down: row 0 is at the top, and no circle widens the panel.
+    assert circles.get_ylim() == (23.5, -0.5)
+
+
+def test_localization_shows_nan_before_and_the_estimate_after() -> None:
+    before, after = draw_localization(scene()).axes
+    d = [f"{v:.3f}" for v in scene().outputs["locate"][0].distance]
+    assert texts(before, BLUE) == ["0.500", "NaN"]
+    assert texts(before, RED) == [d[0], "NaN"]
+    assert texts(after, BLUE) == ["0.500", "0.500"]
+    assert texts(after, RED) == d
+
+
+def test_diameters_stand_at_the_centres_and_unknown_ones_say_so() -> None:
+    (axes,) = draw_diameter(scene()).axes
+    assert texts(axes, RED) == ["41", "NaN"]
+    assert [t.get_position() for t in axes.texts] == [(10, 5), (20, 12)]
+
+
+def dome() -> Trace:
+    """One mushroom, a half ball of 20 mm, in the middle of a small image at half a metre."""
+    camera = Camera(96, 72, 600.0, 600.0, 47.5, 35.5)
+    v, u = np.mgrid[:72, :96]
+    square = ((u - 47.5) / 600 * 0.5) ** 2 + ((v - 35.5) / 600 * 0.5) ** 2
+    depth = 0.5 - np.sqrt(np.maximum(0, 0.02**2 - square))
+    frame = make_frame(
+        color=np.full((72, 96, 3), 90, np.uint8),
+        depth=depth.astype(np.float32),
+        depth_scale=1.0,
+        camera=camera,
+    )
+    circles = Circles(np.array([[47.5, 35.5]]), np.array([24.0]), np.ones(1))
+    locations = Locations(
+        position=np.array([[0, 0, 0.48]]),
+        distance=np.array([0.48]),
+        diameter=np.array([0.04]),
+        source=np.array([DepthSource.MEASURED]),
+        sigma_position=np.full((1, 3), NAN),
+        sigma_diameter=np.full(1, NAN),
+    )
+    return trace_of(frame, detect=circles, locate=locations)
+
+
+@needs_open3d
+def test_pose_shows_the_model_before_and_after_beside_the_same_sample() -> None:
+    before, after = draw_pose(dome(), {"model": "cap", "global": "none", "up": (0, 0, -1)}).axes
+    (model, sample), (moved, same) = before.collections, after.collections
+    for a, b in zip(sample._offsets3d, same._offsets3d, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert any((a != b).any() for a, b in zip(model._offsets3d, moved._offsets3d, strict=True))
+    # Up in the picture is towards the camera: the smaller z.
+    low, high = before.get_zlim()
+    assert low > high
+    # The sample is the half ball, 40 mm across and at most 20 mm high.
+    x, y, z = (np.ptp(np.asarray(offsets)) for offsets in sample._offsets3d)
+    assert 35 < x < 41
+    assert 35 < y < 41
+    assert 10 < z < 21
+    with pytest.raises(UsageError, match="no mushroom has enough depth"):
+        draw_pose(dome(), {"min_points": 10_000})
+
+
+def test_what_is_missing_is_named(tmp_path: Path) -> None:
+    trace = trace_of(make_frame(0))
+    with pytest.raises(UsageError, match="frame 10 has no Circles"):
+        draw_stages(trace)
+    colour_only = Trace(make_frame(0, depth=None), scene().outputs, {})
+    with pytest.raises(UsageError, match="frame 10 has no depth"):
+        draw_localization(colour_only)
+
+
+def test_the_command_writes_an_image(tmp_path: Path) -> None:
+    results = record(tmp_path / "out.mcap", [scene()])
+    for kind in ("stages", "localization", "diameter"):
+        out = tmp_path / f"{kind}.png"
+        command = ["figure", str(results), "--frame", "10", "--kind", kind, "-o", str(out)]
+        assert CliRunner().invoke(app, command).exit_code == 0
+        image = cv2.imread(str(out))
+        assert image is not None
+        assert image.std() > 10
+    wrong = CliRunner().invoke(app, ["figure", str(results), "--frame", "10", "-o", "a.xyz"])
+    assert isinstance(wrong.exception, UsageError)

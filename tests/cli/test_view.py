@@ -1,0 +1,62 @@
+"""`mushpipe view`: what is opened, and what is said where nothing can be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from rerun.chunk import RrdReader
+from typer.testing import CliRunner
+
+from mushpipe import Trace
+from mushpipe.cli import app
+from mushpipe.core.errors import DependencyError, InputError
+from tests.io.values import make_circles, make_frame, make_picks, record, trace_of
+
+
+def entities(path: Path) -> dict[str, int]:
+    """Return the rows of each entity that are not static."""
+    rows: dict[str, int] = {}
+    for chunk in RrdReader(path).stream():
+        if not chunk.is_static:
+            rows[chunk.entity_path] = rows.get(chunk.entity_path, 0) + chunk.num_rows
+    return rows
+
+
+def test_results_are_shown_with_all_their_layers(tmp_path: Path) -> None:
+    traces = [trace_of(make_frame(i), detect=make_circles(), pick=make_picks()) for i in range(3)]
+    results, out = record(tmp_path / "out.mcap", traces), tmp_path / "out.rrd"
+    assert CliRunner().invoke(app, ["view", str(results), "--save", str(out)]).exit_code == 0
+    rows = entities(out)
+    assert rows["/camera/image/picks"] == rows["/camera/image/color"] == 3
+    assert rows["/plots/time/detect"] == 3
+    assert len(RrdReader(out).blueprints()) == 1
+
+
+def test_a_recording_is_shown_as_it_is(tmp_path: Path) -> None:
+    recording = record(tmp_path / "bed.mcap", [Trace(make_frame(i), {}, {}) for i in range(2)])
+    out = tmp_path / "bed.rrd"
+    assert CliRunner().invoke(app, ["view", str(recording), "--save", str(out)]).exit_code == 0
+    rows = entities(out)
+    assert rows["/camera/image/color"] == rows["/camera/cloud"] == 2
+    assert "/camera/image/picks" not in rows
+
+
+def test_a_damaged_file_is_shown_as_far_as_it_goes(tmp_path: Path) -> None:
+    path, out = record(tmp_path / "a.mcap", [trace_of(make_frame())]), tmp_path / "a.rrd"
+    path.write_bytes(path.read_bytes()[:-9])
+    result = CliRunner().invoke(app, ["view", str(path), "--save", str(out)])
+    assert isinstance(result.exception, InputError)
+    assert entities(out)["/camera/image/color"] == 1
+
+
+def test_without_a_display_it_says_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    path = record(tmp_path / "a.mcap", [trace_of(make_frame())])
+    error = CliRunner().invoke(app, ["view", str(path)]).exception
+    assert isinstance(error, DependencyError)
+    assert "--save out.rrd" in str(error)
+    assert "--serve 9876" in str(error)

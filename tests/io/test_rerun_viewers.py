@@ -1,0 +1,155 @@
+"""Where the sink `rerun` sends: files, viewers, servers; and the layout that goes with it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+
+from mushpipe import Mask, RunInfo, Trace
+from mushpipe.core.errors import DependencyError, UsageError
+from mushpipe.sinks import rerun
+from mushpipe.sinks.rerun import RerunSink
+from tests.io.rerun_file import feed, show
+from tests.io.values import make_frame, make_picks, trace_of
+
+
+def test_the_file_has_one_layout_and_is_whole(tmp_path: Path) -> None:
+    mask = Mask(np.zeros((24, 32), bool))
+    show(tmp_path, [trace_of(make_frame(), segment=mask, pick=make_picks())])
+    reader = RrdReader(tmp_path / "out.rrd")
+    assert len(reader.recordings()) == 1
+    assert len(reader.blueprints()) == 1
+    command = [sys.executable, "-m", "rerun", "rrd", "verify", str(tmp_path / "out.rrd")]
+    verified = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert verified.returncode == 0, verified.stderr
+
+
+def test_the_layout_grows_when_depth_or_results_come_late(tmp_path: Path) -> None:
+    sent = []
+    sink = RerunSink(save=tmp_path / "out.rrd")
+    sink.open(RunInfo("bed", {}))
+    sink._recording.send_blueprint = lambda blueprint: sent.append(blueprint)
+    bare = Trace(make_frame(0, depth=None), {}, {})
+    full = trace_of(make_frame(2), a=make_picks())
+    for trace in (bare, bare, trace_of(make_frame(1)), full, full):
+        sink.consume(trace)
+    sink.close()
+    views = [{v.name for v in walk(b.root_container)} for b in sent]
+    assert views[0] == {"Image", "Mushrooms", "Time per stage, ms", "Log"}
+    assert views[1] == views[2] == views[0] | {"Bed", "Depth, holes red", "Depth valid, %"}
+
+
+def walk(part: Any) -> list[Any]:
+    """Return the views in a container of a blueprint."""
+    inside = getattr(part, "contents", [])
+    return [part] if not hasattr(part, "kind") else [v for p in inside for v in walk(p)]
+
+
+def free_port() -> int:
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return int(s.getsockname()[1])
+
+
+def test_a_run_is_served_to_viewers_on_this_machine_only(tmp_path: Path) -> None:
+    port = free_port()
+    sink = RerunSink(serve=port, save=tmp_path / "out.rrd")
+    sink.open(RunInfo("bed", {}))
+    listening = Path("/proc/net/tcp").read_text()
+    sink.consume(trace_of(make_frame(), pick=make_picks()))
+    sink.close()
+    assert f"0100007F:{port:04X} 00000000:0000 0A" in listening
+    assert f"00000000:{port:04X}" not in listening
+    assert (tmp_path / "out.rrd").stat().st_size > 0
+    wait_for(port, False)
+
+
+def test_what_is_sent_to_a_viewer_arrives(tmp_path: Path) -> None:
+    port = free_port()
+    stored = tmp_path / "arrived.rrd"
+    # Rerun's own command line plays the viewer that receives.
+    command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--port", str(port)]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    viewer = subprocess.Popen([*command, "--save", str(stored)], **quiet)
+    try:
+        wait_for(port)
+        feed(
+            RerunSink(connect=f"rerun+http://127.0.0.1:{port}/proxy"),
+            [trace_of(make_frame(), pick=make_picks())],
+        )
+        viewer.send_signal(signal.SIGINT)
+        viewer.wait(20)
+    finally:
+        viewer.kill()
+    assert "/camera/image/picks" in {c.entity_path for c in RrdReader(stored).stream()}
+
+
+def test_a_viewer_is_opened_for_this_machine_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started, stored, start = [], tmp_path / "shown.rrd", rerun._start
+
+    def instead(host: str, port: int, *arguments: str) -> subprocess.Popen[bytes]:
+        started.append((host, arguments, start(host, port, "--save", str(stored))))
+        return started[0][2]
+
+    monkeypatch.setenv("DISPLAY", ":99")
+    monkeypatch.setattr(rerun, "PORT", free_port())
+    monkeypatch.setattr(rerun, "_start", instead)
+    try:
+        for _ in range(2):  # the viewer of the first run takes the second one too
+            feed(RerunSink(spawn=True, memory="300MB"), [trace_of(make_frame(), pick=make_picks())])
+        ((host, arguments, viewer),) = started
+        assert (host, arguments) == ("127.0.0.1", ("--memory-limit", "300MB"))
+        assert viewer.poll() is None  # it stays open when the run is over
+    finally:
+        for _, _, viewer in started:
+            os.killpg(viewer.pid, signal.SIGINT)
+            viewer.wait(20)
+    assert "/camera/image/picks" in {c.entity_path for c in RrdReader(stored).stream()}
+
+
+def wait_for(port: int, listening: bool = True) -> None:
+    for _ in range(200):
+        with socket.socket() as probe:
+            if (probe.connect_ex(("127.0.0.1", port)) == 0) == listening:
+                return
+        time.sleep(0.1)
+    raise TimeoutError(port)
+
+
+def test_what_cannot_be_opened_is_refused_with_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(UsageError, match="set 'save', 'spawn', 'connect' or 'serve'"):
+        feed(RerunSink(), [])
+    with pytest.raises(UsageError, match="no viewer answers at 127"):
+        feed(RerunSink(connect=f"rerun+http://127.0.0.1:{free_port()}/proxy"), [])
+    with pytest.raises(UsageError, match="is not like"):
+        feed(RerunSink(connect="localhost"), [])
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(DependencyError, match="no display"):
+        feed(RerunSink(spawn=True), [])
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        sink = RerunSink(serve=taken.getsockname()[1])
+        with pytest.raises(UsageError, match="is taken"):
+            feed(sink, [])
+
+
+def test_it_takes_only_the_newest_frame_when_live_and_can_be_closed_twice(tmp_path: Path) -> None:
+    sink = RerunSink(save=tmp_path / "{recording}.rrd")
+    assert sink.delivery == "latest"
+    feed(sink, [trace_of(make_frame())])
+    sink.close()
+    assert (tmp_path / "bed.rrd").stat().st_size > 0

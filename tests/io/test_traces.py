@@ -1,0 +1,111 @@
+"""Result recordings read back frame by frame, against what was recorded."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mushpipe import Circles, Locations, Mask, Picks, RunInfo, Trace
+from mushpipe.core.errors import InputError, UsageError
+from mushpipe.core.manifest import _describe
+from mushpipe.sinks.mcap import McapSink
+from mushpipe.traces import read_trace, read_traces
+from tests.io.values import make_circles, make_frame, make_picks, no_picks, record, trace_of
+
+
+def full_trace(i: int) -> Trace:
+    frame, circles = make_frame(i), make_circles()
+    mask = np.zeros((24, 32), bool)
+    mask[i : i + 4, 3:9] = True
+    nan = np.full(2, np.nan)
+    locations = Locations(
+        position=np.array([[0.1, 0.2, 0.5], [np.nan] * 3]),
+        distance=np.array([0.55, np.nan]),
+        diameter=np.array([0.04, np.nan]),
+        source=np.array([1, 0]),
+        sigma_position=np.full((2, 3), np.nan),
+        sigma_diameter=nan,
+    )
+    changed = replace(frame, color=np.full_like(frame.color, 40 + i), attached={})
+    return trace_of(
+        frame,
+        flatten=changed,
+        segment=Mask(mask, ~mask),
+        open=Mask(mask),
+        detect=(circles, locations),
+        pick=make_picks() if i else no_picks(),
+    )
+
+
+def same(value: object, other: object) -> None:
+    assert type(value) is type(other)
+    for name, field in vars(value).items():
+        if isinstance(field, np.ndarray):
+            np.testing.assert_array_equal(field, getattr(other, name), err_msg=name)
+
+
+def test_a_trace_is_read_back_as_it_was(tmp_path: Path) -> None:
+    traces = [full_trace(i) for i in range(3)]
+    path = record(tmp_path / "out.mcap", traces)
+    found = list(read_traces(path))
+    assert len(found) == 3
+    for trace, again in zip(traces, found, strict=True):
+        same(trace.frame, again.frame)
+        assert trace.frame.header == again.frame.header
+        assert dict(again.durations_ns) == dict(trace.durations_ns)
+        assert set(again.outputs) == set(trace.outputs) - {"source"}
+        for stage, values in again.outputs.items():
+            assert len(values) == len(trace.outputs[stage])
+            for value, other in zip(values, trace.outputs[stage], strict=True):
+                same(other, value)
+    assert isinstance(found[0].outputs["segment"][0], Mask)
+    assert isinstance(found[1].outputs["pick"][0], Picks)
+    assert isinstance(found[1].outputs["detect"][0], Circles)
+
+
+def test_a_frame_that_no_stage_answered_stands_alone(tmp_path: Path) -> None:
+    traces = [full_trace(0), Trace(make_frame(1), {}, {}), full_trace(2)]
+    path = record(tmp_path / "out.mcap", traces)
+    assert [bool(t.outputs) for t in read_traces(path)] == [True, False, True]
+    assert read_trace(path, 12).frame.header.sequence == 12
+    with pytest.raises(UsageError, match="no frame 3; it holds 10 to 12"):
+        read_trace(path, 3)
+
+
+def test_images_come_from_the_recording_named_in_the_manifest(tmp_path: Path) -> None:
+    traces = [full_trace(i) for i in range(2)]
+    source = record(tmp_path / "bed.mcap", [Trace(t.frame, {}, {}) for t in traces])
+    manifest = {
+        "graph": {"source": {"use": "mcap", "path": "elsewhere/bed.mcap"}, "stages": {}},
+        "recordings": [_describe(source)],
+    }
+    results = tmp_path / "out.mcap"
+    sink = McapSink(path=results, frames=False)
+    sink.open(RunInfo("bed", manifest))
+    for trace in traces:
+        sink.consume(trace)
+    sink.close()
+    found = list(read_traces(results))
+    assert [len(t.outputs) for t in found] == [5, 5]
+    np.testing.assert_array_equal(found[1].frame.color, traces[1].frame.color)
+    # Another recording of that name does not count.
+    shutil.copy(results, source)
+    with pytest.raises(UsageError, match=r"holds no images, and bed\.mcap is neither"):
+        list(read_traces(results))
+
+
+def test_damage_is_reported_after_the_last_good_frame(tmp_path: Path) -> None:
+    path = record(tmp_path / "out.mcap", [full_trace(i) for i in range(3)])
+    path.write_bytes(path.read_bytes()[:-400])
+    frames = []
+    with pytest.raises(InputError, match="damaged"):
+        frames.extend(read_traces(path))
+
+
+def test_a_recording_without_results_is_its_frames(tmp_path: Path) -> None:
+    path = record(tmp_path / "bed.mcap", [Trace(make_frame(i), {}, {}) for i in range(2)])
+    assert [t.outputs for t in read_traces(path)] == [{}, {}]
