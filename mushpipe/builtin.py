@@ -20,6 +20,7 @@ def mushpipe_register(registry: Registry) -> None:
     registry.stage("cap-net", "mushpipe.stages.cap_net:CapNet")
     registry.stage("onnx", "mushpipe.stages.onnx_model:Onnx")
     registry.stage("hough", "mushpipe.stages.hough:Hough")
+    registry.stage("hough-skimage", "mushpipe.stages.hough:HoughSkimage")
     registry.stage("nearest-depth", "mushpipe.stages.nearest_depth:NearestDepth")
     registry.stage("depth-correct", "mushpipe.stages.depth_correct:DepthCorrect")
     registry.stage("fuse-depth", "mushpipe.stages.fuse_depth:FuseDepth")

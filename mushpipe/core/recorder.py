@@ -8,7 +8,7 @@ import sys
 from collections.abc import Mapping
 from io import FileIO
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import IO, Any, Literal, cast
 
 from mcap.writer import CompressionType, IndexType, Writer
 
@@ -24,7 +24,7 @@ class RecordingError(MushpipeError):
 
 
 class RecordingWriter:
-    """Writes MCAP of zstd chunks of 1 MiB with CRCs; a topic gets its channel on first use.
+    """Writes MCAP of compressed chunks of 1 MiB with CRCs; a topic gets its channel on first use.
 
     A killed process loses at most the open chunk. To `STDIO` it writes a stream instead: without
     chunks or index, so that each message leaves at once.
@@ -35,12 +35,17 @@ class RecordingWriter:
         UsageError: Standard output is a terminal.
     """
 
-    def __init__(self, path: Path, metadata: Mapping[str, Mapping[str, str]]) -> None:
+    def __init__(
+        self,
+        path: Path,
+        metadata: Mapping[str, Mapping[str, str]],
+        compression: Literal["zstd", "lz4"] = "zstd",
+    ) -> None:
         stream = path == STDIO
         self._output = _Output(_standard_output() if stream else _create(path), path)
         self._writer = Writer(
             cast(IO[bytes], self._output),
-            compression=CompressionType.ZSTD,
+            compression=CompressionType[compression.upper()],
             use_chunking=not stream,
             index_types=IndexType.NONE if stream else IndexType.ALL,
             enable_crcs=True,

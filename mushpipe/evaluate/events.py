@@ -89,6 +89,7 @@ class Events(Columns):
         sigma_position: (N, 3).
         sigma_diameter: (N,).
         sigma_tilt: (N,) rad.
+        score: (N,) 0..1, how likely it was said to be right.
         up: (N, 3) unit vector against gravity.
     """
 
@@ -111,6 +112,7 @@ class Events(Columns):
     sigma_position: Floats = column(3)
     sigma_diameter: Floats = column()
     sigma_tilt: Floats = column()
+    score: Floats = column()
     up: Floats = column(3)
 
 
@@ -157,7 +159,7 @@ def _frame(unit: int, verdict: Verdict, up: Floats) -> dict[str, NDArray[Any]]:
     }
     for name in _TRUTH_SIDE:
         part[f"true_{name}"] = _pick(getattr(verdict.truth.caps, name), truth_rows)
-    for name in (*_FOUND_SIDE, *_SIGMAS):
+    for name in (*_FOUND_SIDE, *_SIGMAS, "score"):
         part[name] = _pick(getattr(verdict.detections, name), rows)
     if not comparable(verdict):
         part |= {name: np.full((n, 3), np.nan) for name in _TRUE_3D}

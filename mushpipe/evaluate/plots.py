@@ -59,6 +59,7 @@ def plots_of(events: Events, prefix: str) -> list[Plot]:
 
     makers: list[Callable[[Events], tuple[Figure | None, str, str, bool]]] = [
         _by_radius,
+        _reliability,
         _against_tilt,
         _histograms,
         _calibration,
@@ -201,6 +202,32 @@ def _histograms(events: Events) -> tuple[Figure | None, str, str, bool]:
     for axes in panels[len(known) :]:
         axes.set_visible(False)
     return figure, title, caption, True
+
+
+def _reliability(events: Events) -> tuple[Figure | None, str, str, bool]:
+    title = "Reliability of the score"
+    caption = (
+        "Detections grouped by score: mean score and share that is right; bars are 95 % (Wilson). "
+        "On the dashed line a score is the probability of being right."
+    )
+    stated = np.isfinite(events.score)
+    if not stated.any():
+        return None, title, caption, False
+    score, right = events.score[stated], events.kind[stated] == Kind.FOUND
+    edges = bins_of(score)
+    bins = np.clip(np.digitize(score, edges) - 1, 0, max(0, len(edges) - 2))
+    trials = np.bincount(bins)
+    used = trials > 0
+    trials = trials[used]
+    mean = np.bincount(bins, weights=score)[used] / trials
+    hits = np.bincount(bins, weights=right)[used]
+    share, (low, high) = hits / trials, wilson(hits, trials)
+    figure, (axes,) = _axes()
+    axes.plot([0, 1], [0, 1], "--", lw=0.9, color=INK, alpha=0.5)
+    bars = np.maximum(0, [share - low, high - share])
+    axes.errorbar(mean, share, bars, fmt="o-", ms=4, lw=1.2, color=BLUE)
+    axes.set(xlim=(0, 1), ylim=(0, 1.02), xlabel="score", ylabel="share that is right")
+    return figure, title, caption, False
 
 
 def _whole() -> Any:

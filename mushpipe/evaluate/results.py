@@ -35,6 +35,7 @@ class Detections(Columns):
         sigma_position: (N, 3) m one sigma.
         sigma_diameter: (N,) m one sigma.
         sigma_tilt: (N,) rad one sigma.
+        score: (N,) 0..1, how likely it is right.
         frame_id: The frame of the 3D values.
     """
 
@@ -48,6 +49,7 @@ class Detections(Columns):
     sigma_position: Floats = column(3)
     sigma_diameter: Floats = column()
     sigma_tilt: Floats = column()
+    score: Floats = column()
     frame_id: str = ""
 
 
@@ -60,7 +62,8 @@ def of_picks(picks: Picks) -> Detections:
 
 def of_circles(circles: Circles) -> Detections:
     """Return circles as detections of which nothing in 3D is known."""
-    return Detections.unknown(len(circles), center=circles.center, radius=circles.radius)
+    known = {name: getattr(circles, name) for name in ("center", "radius", "score")}
+    return Detections.unknown(len(circles), **known)
 
 
 def none_found() -> Detections:

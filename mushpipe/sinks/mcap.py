@@ -26,9 +26,14 @@ class McapSink(Sink):
     delivery: ClassVar[Literal["every", "latest"]] = "every"
 
     path: GraphPath = Field(description="file to write; {recording} is the name of the input")
-    frames: bool = Field(True, description="record colour and depth beside the results")
+    frames: bool = Field(
+        True, description="record colour and depth, also those that stages made, beside the results"
+    )
     jpeg_quality: int | None = Field(
         None, ge=1, le=100, description="store colour as JPEG of this quality; lossless if not set"
+    )
+    compression: Literal["zstd", "lz4"] = Field(
+        "zstd", description="lz4 takes a third of the time and half as much room again"
     )
     drawings: bool = Field(
         True, description="record how viewers draw circles and picks, beside the tables"
@@ -65,14 +70,15 @@ class McapSink(Sink):
         manifest = {"json": json.dumps(dict(run.manifest))}
         if path == STDIO and run.live:
             manifest["live"] = "true"
-        return RecordingWriter(path, {MANIFEST: manifest})
+        return RecordingWriter(path, {MANIFEST: manifest}, self.compression)
 
     def consume(self, trace: Trace) -> None:
         """Write one frame and its results."""
         writer, frame = self._next_writer(), trace.frame
         if self.frames:
             writer.frame(frame, self.jpeg_quality)
-        for topic, message in result_messages(trace, self._unknown, self.drawings):
+        results = result_messages(trace, self._unknown, self.drawings, self.frames)
+        for topic, message in results:
             writer.write(topic, message, frame.header)
         if self.timing and trace.durations_ns:
             writer.write(*timing_message(trace), frame.header)

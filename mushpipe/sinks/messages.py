@@ -6,7 +6,7 @@ import logging
 from collections.abc import Iterator
 from typing import Any
 
-from mushpipe import Trace
+from mushpipe import RgbdFrame, Trace
 from mushpipe.core import wire
 from mushpipe.core.scene import drawings
 
@@ -14,14 +14,18 @@ logger = logging.getLogger("mushpipe")
 Published = tuple[str, wire.Message]
 
 
-def result_messages(trace: Trace, unknown: set[type], drawn: bool) -> Iterator[Published]:
+def result_messages(
+    trace: Trace, unknown: set[type], drawn: bool, images: bool = True
+) -> Iterator[Published]:
     """Yield topic and message of every stage's output, in graph order.
 
     Args:
         trace: The frame.
         unknown: Types without a wire form, filled here; each is warned of once.
         drawn: Whether circles and picks come with their drawings for viewers as well.
+        images: Whether colour and depth that a stage made are among them.
     """
+    passed_on = {id(trace.frame.color), id(trace.frame.depth)}
     for stage in trace.durations_ns:
         values = trace.outputs[stage]
         for value in values:
@@ -32,10 +36,24 @@ def result_messages(trace: Trace, unknown: set[type], drawn: bool) -> Iterator[P
             # Several outputs of one stage need several topics; the first keeps the stage's own.
             own = "" if value is values[0] else f"/{type(value).__name__.lower()}"
             topic = f"{wire.RESULT_PREFIX}{stage}{own}"
-            for message in encoder(value, trace.frame.header):
+            messages = encoder(value, trace.frame.header)
+            if isinstance(value, RgbdFrame):
+                messages = _made(value, messages, passed_on) if images else iter(())
+            for message in messages:
                 yield topic + message.suffix, message
             for message in drawings(value, trace.frame.header) if drawn else ():
                 yield topic + message.suffix, message
+
+
+def _made(
+    frame: RgbdFrame, messages: Iterator[wire.Message], passed_on: set[int]
+) -> Iterator[wire.Message]:
+    """Yield the images of a frame that are new: what a stage passed on was written before."""
+    images = {"/color": frame.color, "/depth": frame.depth}
+    for message in messages:
+        if id(images[message.suffix]) not in passed_on:
+            yield message
+    passed_on |= {id(image) for image in images.values()}
 
 
 def timing_message(trace: Trace) -> Published:

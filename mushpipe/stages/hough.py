@@ -1,4 +1,4 @@
-"""Circles by OpenCV's Hough transform: the plain peer of the phase-coded one."""
+"""Circles by the Hough transforms of OpenCV and scikit-image: peers of the phase-coded one."""
 
 from __future__ import annotations
 
@@ -15,22 +15,11 @@ Floats = NDArray[np.float64]
 Radius = Annotated[float, Field(gt=0)]
 
 
-class Hough(Stage):
-    """Detects circles with OpenCV's HoughCircles, in the gray image or in the mask.
-
-    A circle's score is the share of its disc that the mask covers. Of circles that stand in the
-    same place the one OpenCV ranks first is kept.
-    """
+class _Peer(Stage):
+    """What the peers share: their input, and which of their circles are kept."""
 
     input: Literal["image", "mask"] = Field("image", description="where the edges are taken from")
-    method: Literal["alt", "gradient"] = Field(
-        "alt", description="HOUGH_GRADIENT_ALT, which is more precise, or HOUGH_GRADIENT"
-    )
     radius_px: tuple[Radius, Radius] = Field((8, 38), description="smallest and largest radius, px")
-    edge: float = Field(150, gt=0, description="upper Canny threshold, in OpenCV's units")
-    perfectness: float = Field(0.6, gt=0, lt=1, description="`alt`: how round a circle must be")
-    votes: float = Field(14, gt=0, description="`gradient`: fewest votes of a centre")
-    min_distance_px: float = Field(12, gt=0, description="smallest distance of two centres, px")
     apart: float = Field(
         0.7, ge=0, description="smallest distance of two centres, in radii of the larger circle"
     )
@@ -43,16 +32,36 @@ class Hough(Stage):
         return self
 
     def process(self, frame: RgbdFrame, mask: Mask) -> Circles:
-        """Return the circles in OpenCV's order of evidence."""
+        """Return the circles in the library's order of evidence."""
         gray = frame.gray if self.input == "image" else mask.foreground.astype(np.float32)
-        circles = self._candidates(np.rint(gray * 255).astype(np.uint8))
+        circles = self._candidates(gray)
         score = np.array([disc_cover(mask.foreground, *circle) for circle in circles])
         covered = np.flatnonzero(score >= self.min_score)
         keep = covered[first_of_each_place(circles[covered], self.apart)]
         return Circles(circles[keep, :2], circles[keep, 2], score[keep])
 
-    def _candidates(self, image: NDArray[np.uint8]) -> Floats:
-        """Return (N, 3) x, y, radius."""
+    def _candidates(self, gray: NDArray[np.float32]) -> Floats:
+        """Return (N, 3) x, y, radius of circles in an image (H, W) of 0..1, the best first."""
+        raise NotImplementedError
+
+
+class Hough(_Peer):
+    """Detects circles with OpenCV's HoughCircles, in the gray image or in the mask.
+
+    A circle's score is the share of its disc that the mask covers. Of circles that stand in the
+    same place the one OpenCV ranks first is kept.
+    """
+
+    method: Literal["alt", "gradient"] = Field(
+        "alt", description="HOUGH_GRADIENT_ALT, which is more precise, or HOUGH_GRADIENT"
+    )
+    edge: float = Field(150, gt=0, description="upper Canny threshold, in OpenCV's units")
+    perfectness: float = Field(0.6, gt=0, lt=1, description="`alt`: how round a circle must be")
+    votes: float = Field(14, gt=0, description="`gradient`: fewest votes of a centre")
+    min_distance_px: float = Field(12, gt=0, description="smallest distance of two centres, px")
+
+    def _candidates(self, gray: NDArray[np.float32]) -> Floats:
+        image = np.rint(gray * 255).astype(np.uint8)
         alt = self.method == "alt"
         found = cv2.HoughCircles(
             cv2.GaussianBlur(image, (5, 5), 1.2),
@@ -66,6 +75,29 @@ class Hough(Stage):
         )
         circles = np.zeros((0, 3)) if found is None else np.asarray(found[0, :, :3], np.float64)
         return circles[circles[:, 2] > 0]
+
+
+class HoughSkimage(_Peer):
+    """Detects circles with scikit-image's hough_circle, on Canny edges of the image or the mask.
+
+    The textbook's transform: an accumulator per radius, in whole pixels, without gradients; it
+    takes about a second per frame. Scores and places as in `hough`.
+    """
+
+    sigma: float = Field(1.5, gt=0, description="smoothing before Canny's edges, px")
+    votes: float = Field(0.35, gt=0, le=1, description="least share of the outline with edges")
+
+    def _candidates(self, gray: NDArray[np.float32]) -> Floats:
+        from skimage.feature import canny
+        from skimage.transform import hough_circle, hough_circle_peaks
+
+        smallest, largest = self.radius_px
+        radii = np.arange(max(1, round(smallest)), min(round(largest), max(gray.shape)) + 1)
+        if not len(radii):
+            return np.zeros((0, 3))
+        space = hough_circle(canny(np.asarray(gray, np.float64), self.sigma), radii)
+        _, x, y, radius = hough_circle_peaks(space, radii, threshold=self.votes)
+        return np.column_stack([x, y, radius]).astype(np.float64)
 
 
 def first_of_each_place(circles: Floats, apart: float) -> NDArray[np.intp]:

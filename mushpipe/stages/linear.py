@@ -1,4 +1,4 @@
-"""Small least-squares problems, solved without a threaded BLAS.
+"""Small linear problems, solved without a threaded BLAS.
 
 A library that starts threads for a 7 x 7 system costs more than the system, and far more where the
 cores are busy.
@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+
+from mushpipe.core.jit import jit
 
 Floats = NDArray[np.float64]
 
@@ -27,3 +29,19 @@ def least_squares(columns: Floats, target: Floats, weight: Floats | None = None)
     normal = np.einsum("mi,mj->ij", weighted, columns)
     right = np.einsum("mi,m->i", weighted, target)
     return np.asarray(np.linalg.lstsq(normal, right)[0])
+
+
+@jit
+def solve(a: Floats, b: Floats) -> None:
+    """Solve a x = b in place for a small positive definite matrix; x replaces b."""
+    size = len(b)
+    for i in range(size):
+        for j in range(i + 1, size):
+            factor = a[j, i] / a[i, i]
+            for k in range(i, size):
+                a[j, k] -= factor * a[i, k]
+            b[j] -= factor * b[i]
+    for i in range(size - 1, -1, -1):
+        for k in range(i + 1, size):
+            b[i] -= a[i, k] * b[k]
+        b[i] /= a[i, i]

@@ -16,6 +16,7 @@ from mushpipe.core.jit import jit
 from mushpipe.stages.phase_edges import Edges, Plane, Rows
 from mushpipe.stages.phase_refit import (
     HIDDEN,
+    NARROW,
     Shape,
     Table,
     fit_outline,
@@ -128,7 +129,7 @@ def probability(row: Table, weights: Table) -> float:
 @jit
 def _use_up(edges: Edges, shape: Shape, number: int, owner: Rows, rows: Rows) -> None:
     nothing = np.zeros((0, 0), np.float32)
-    count = gather(edges, nothing, 0.0, shape, 1, rows)
+    count = gather(edges, nothing, 0.0, shape, NARROW, 1, rows)
     near = max(TAKEN, 1.3 * tolerance(shape[2]))
     for k in range(count):
         dx, dy = edges.x[rows[k]] - shape[0], edges.y[rows[k]] - shape[1]
@@ -220,7 +221,7 @@ def polish(edges: Edges, height: Plane, pixel: float, outlines: Table, owner: Ro
     for k in range(len(outlines)):
         shape[:] = outlines[k]
         near = _neighbours(shape, outlines[:k])
-        count = gather(edges, height, step_up(shape[2] * pixel), shape, 1, rows)
+        count = gather(edges, height, step_up(shape[2] * pixel), shape, NARROW, 1, rows)
         kept = 0
         for m in range(count):
             row = rows[m]
@@ -229,7 +230,7 @@ def polish(edges: Edges, height: Plane, pixel: float, outlines: Table, owner: Ro
             if not _covered(edges.x[row], edges.y[row], near, -SHADE):
                 own[kept] = row
                 kept += 1
-        moved = fit_outline(edges, own, kept, shape, 1) if kept >= 12 else False
+        moved = fit_outline(edges, own, kept, shape, NARROW, 1) if kept >= 12 else False
         limit = max(1.5, 0.15 * outlines[k, 2])
         away = math.hypot(shape[0] - outlines[k, 0], shape[1] - outlines[k, 1])
         if moved and abs(shape[2] - outlines[k, 2]) < limit and away < limit:

@@ -130,10 +130,10 @@ def otsu_of(size: Plane, top: float) -> float:
 def _at(plane: Plane, x: float, y: float) -> float:
     """Bilinear value; the point lies within the image."""
     u, v = int(x), int(y)
-    fx, fy = x - u, y - v
-    top = plane[v, u] * (1 - fx) + plane[v, u + 1] * fx
-    bottom = plane[v + 1, u] * (1 - fx) + plane[v + 1, u + 1] * fx
-    return float(top * (1 - fy) + bottom * fy)
+    fx, fy = np.float32(x - u), np.float32(y - v)
+    top = plane[v, u] + fx * (plane[v, u + 1] - plane[v, u])
+    bottom = plane[v + 1, u] + fx * (plane[v + 1, u + 1] - plane[v + 1, u])
+    return float(top + fy * (bottom - top))
 
 
 @jit
@@ -175,6 +175,7 @@ def thin(
     """
     height, width = size.shape
     count = 0
+    half, ahead_of = np.float32(0.5), np.float32(1.1)
     for y in range(2, height - 2):
         for x in range(2, width - 2):
             m = size[y, x]
@@ -182,7 +183,7 @@ def thin(
                 continue
             nx, ny = gx[y, x] / m, gy[y, x] / m
             # most pixels lie on a slope that goes on: one look ahead spares the interpolation
-            if size[y + round(ny), x + round(nx)] > 1.1 * m:
+            if size[int(y + ny + half), int(x + nx + half)] > ahead_of * m:
                 continue
             ahead = _at(size, x + nx, y + ny)
             behind = _at(size, x - nx, y - ny)

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
+from mushpipe.stages.linear import solve
 from mushpipe.stages.phase_edges import Gradient, Plane, Rows
-from mushpipe.stages.phase_refit import HIDDEN, Shape, Table, solve, turned
+from mushpipe.stages.phase_refit import HIDDEN, Shape, Table, turned
 from mushpipe.stages.phase_steps import height_at, rise, step_up
 
 Bytes = NDArray[np.uint8]
@@ -47,11 +48,14 @@ LEARNED = "learned"  # what circles of another detector say; see `phase_learned`
 NAMES = (*IMAGE_FEATURES, *DEPTH_FEATURES, LEARNED)
 FIRST_STATIC = list(NAMES).index("residual")
 FIRST_DEPTH = len(IMAGE_FEATURES)
-GRID = 4  # the surface is sampled at up to (2 GRID + 1)^2 points
 SAMPLES = 16  # directions in which the disc is sampled
 LEAST_KNOWN = 0.35  # share of the disc with depth below which depth features are off
 _TURNS = 2 * np.pi * (np.arange(SAMPLES) + 0.5) / SAMPLES
 _COSINES, _SINES = np.cos(_TURNS), np.sin(_TURNS)
+# The surface is sampled on a grid within 0.75 radii: rows 1, u, v, u^2, u v, v^2, in radii.
+_U, _V = (axis.ravel() for axis in np.meshgrid(*2 * [np.linspace(-0.75, 0.75, 9)]))
+_BASIS = np.column_stack([np.ones(81), _U, _V, _U * _U, _U * _V, _V * _V])
+_BASIS = _BASIS[_U * _U + _V * _V <= 0.5625]
 _RINGS = np.array([0.15, 0.3, 0.45, 0.6, 0.75, 0.88, 0.97])
 
 
@@ -121,53 +125,44 @@ def contrast_features(image: Plane, shape: Shape, row: Table) -> None:
 
 
 @jit
-def _quadric(height: Plane, shape: Shape, sigma: float, a: Table, b: Table) -> tuple[int, int]:
-    """Gather the normal equations of z = b0 + b1 u + b2 v + b3 u^2 + b4 u v + b5 v^2.
+def _quadric(z: Table, sigma: float, a: Table, b: Table) -> None:
+    """Fit z = b0 + b1 u + b2 v + b3 u^2 + b4 u v + b5 v^2 to heights z (P,) m, -1 for unknown.
 
-    Coordinates u, v are in radii. On entry `b` is the previous solution, from which far points
-    (beyond 3 sigma) are left out unless sigma is 0; on return it is the right side. Returns the
-    numbers of points with and without depth.
+    On entry `b` is the previous solution, from which far points (beyond 3 sigma) are left out.
     """
-    n, known, unknown = GRID, 0, 0
     before = b.copy()
     a[:] = 0
     b[:] = 0
-    basis = np.empty(6)
-    for i in range(-n, n + 1):
-        for j in range(-n, n + 1):
-            u, v = 0.75 * i / n, 0.75 * j / n
-            if u * u + v * v > 0.5625:
-                continue
-            z = height_at(height, shape[0] + u * shape[2], shape[1] + v * shape[2])
-            if z == -1:
-                unknown += 1
-                continue
-            known += 1
-            basis[0], basis[1], basis[2] = 1, u, v
-            basis[3], basis[4], basis[5] = u * u, u * v, v * v
-            if sigma > 0 and abs(basis @ before - z) > 3 * sigma:
-                continue
-            for p in range(6):
-                b[p] += basis[p] * z
-                for q in range(6):
-                    a[p, q] += basis[p] * basis[q]
-    return known, unknown
+    for k in range(len(z)):
+        basis = _BASIS[k]
+        if z[k] == -1 or abs(_misfit(z[k], basis, before)) > 3 * sigma:
+            continue
+        for p in range(6):
+            b[p] += basis[p] * z[k]
+            for q in range(p, 6):
+                a[p, q] += basis[p] * basis[q]
+    for p in range(6):
+        a[p, p] += 1e-4
+        for q in range(p):
+            a[p, q] = a[q, p]
+    solve(a, b)
 
 
 @jit
-def _misfit(height: Plane, shape: Shape, b: Table) -> float:
-    """Return the root mean square residual of a quadric, m; each clipped to 0.3 of the radius."""
-    n, count, total = GRID, 0, 0.0
-    for i in range(-n, n + 1):
-        for j in range(-n, n + 1):
-            u, v = 0.75 * i / n, 0.75 * j / n
-            if u * u + v * v > 0.5625:
-                continue
-            z = height_at(height, shape[0] + u * shape[2], shape[1] + v * shape[2])
-            if z != -1:
-                e = b[0] + b[1] * u + b[2] * v + b[3] * u * u + b[4] * u * v + b[5] * v * v - z
-                total += min(abs(e), 0.02) ** 2
-                count += 1
+def _misfit(z: float, basis: Table, b: Table) -> float:
+    """Return by how much (m) a height lies over a quadric."""
+    surface = b[0] + b[1] * basis[1] + b[2] * basis[2]
+    return float(z - surface - b[3] * basis[3] - b[4] * basis[4] - b[5] * basis[5])
+
+
+@jit
+def _rms(z: Table, b: Table) -> float:
+    """Return the root mean square residual (m) of a quadric; each clipped to 20 mm."""
+    total, count = 0.0, 0
+    for k in range(len(z)):
+        if z[k] != -1:
+            total += min(abs(_misfit(z[k], _BASIS[k], b)), 0.02) ** 2
+            count += 1
     return math.sqrt(total / max(count, 1))
 
 
@@ -184,23 +179,23 @@ def surface_features(height: Plane, shape: Shape, pixel: float, row: Table) -> f
     Returns:
         The height of the middle, m; NaN where too little is known.
     """
-    a, b = np.zeros((6, 6)), np.zeros(6)
+    z, known = np.empty(len(_BASIS)), 0
+    for k in range(len(z)):
+        x, y = shape[0] + _BASIS[k, 1] * shape[2], shape[1] + _BASIS[k, 2] * shape[2]
+        z[k] = height_at(height, x, y)
+        known += z[k] != -1
+    row[6] = 1 - known / len(z)
+    if row[6] > 1 - LEAST_KNOWN or known < 8:
+        return math.nan
+    a, b = np.empty((6, 6)), np.zeros(6)
+    _quadric(z, math.inf, a, b)
+    _quadric(z, max(0.001, _rms(z, b)), a, b)
     radius = shape[2] * pixel
-    sigma = 0.0
-    for turn in range(2):
-        known, unknown = _quadric(height, shape, sigma, a, b)
-        row[6] = unknown / max(known + unknown, 1)
-        if row[6] > 1 - LEAST_KNOWN or known < 8:
-            return math.nan
-        for p in range(6):
-            a[p, p] += 1e-4
-        solve(a, b)
-        sigma = max(0.001, _misfit(height, shape, b)) if turn == 0 else sigma
     mean, spread = -(b[3] + b[5]), math.sqrt((b[3] - b[5]) ** 2 + b[4] ** 2)
     row[0] = b[0] / (abs(b[0]) + radius)
     row[1] = min(3.0, max(-2.0, (mean - spread) / radius))
     row[2] = min(4.0, max(-2.0, (mean + spread) / radius))
-    row[3] = min(1.0, _misfit(height, shape, b) / radius)
+    row[3] = min(1.0, _rms(z, b) / radius)
     return float(b[0])
 
 

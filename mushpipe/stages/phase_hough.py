@@ -34,6 +34,7 @@ Positive = Annotated[float, Field(gt=0)]
 Bytes = NDArray[np.uint8]
 _FLOOR = 4.0  # gray levels per px; Otsu's threshold of an image without edges is noise
 _TOP = 64.0  # gray levels per px; larger gradients count as this in Otsu's threshold
+_AROUND = np.ones((7, 7), np.uint8)  # edges are taken so far around the foreground
 _STANDING = 0.004  # m; what is higher than this over the bed is looked at, in the mask or not
 _REACH = 2  # cells around a peak within which it must be the highest
 _SMALLEST = 12  # px; images smaller than this in either direction hold no circle
@@ -144,10 +145,11 @@ class PhaseHough(Stage):
         smallest, largest = self._range(relief, height, width)
         image = _levels(frame, mask, literal)
         gradient = gradient_of(image)
-        region = _region(mask, relief, literal)
+        foreground = _foreground(mask, relief)
         if learned is not None:
-            region = region | discs_of(learned, region.shape)
-        edges = self._edges(image, gradient, region, relief)
+            foreground = foreground | discs_of(learned, foreground.shape)
+        region = np.ones_like(foreground) if literal else cv2.dilate(foreground, _AROUND)
+        edges = self._edges(image, gradient, np.asarray(region, np.uint8), relief)
         cells = vote(
             edges, rings_between(smallest, largest), (-(-height // CELL), -(-width // CELL))
         )
@@ -238,14 +240,12 @@ def _levels(frame: RgbdFrame, mask: Mask, literal: bool) -> Plane:
     return np.asarray(image, np.float32) * np.float32(255)
 
 
-def _region(mask: Mask, relief: Relief | None, literal: bool) -> Bytes:
-    """Return where edges are taken: around the mask, and what stands on the bed."""
-    if literal:
-        return np.ones(mask.foreground.shape, np.uint8)
-    region = cv2.dilate(mask.foreground.view(np.uint8), np.ones((7, 7), np.uint8))
-    if relief is not None:
-        height, width = region.shape
-        standing = (relief.height > _STANDING).view(np.uint8)
-        full = cv2.resize(standing, None, fx=CELL, fy=CELL, interpolation=cv2.INTER_NEAREST)
-        region = region | cv2.dilate(full[:height, :width], np.ones((5, 5), np.uint8))
-    return np.asarray(region, np.uint8)
+def _foreground(mask: Mask, relief: Relief | None) -> Bytes:
+    """Return what is in the mask or stands on the bed, (H, W) 0 or 1."""
+    foreground = mask.foreground.view(np.uint8)
+    if relief is None:
+        return foreground
+    height, width = foreground.shape
+    standing = (relief.height > _STANDING).view(np.uint8)
+    full = cv2.resize(standing, None, fx=CELL, fy=CELL, interpolation=cv2.INTER_NEAREST)
+    return np.asarray(foreground | full[:height, :width], np.uint8)

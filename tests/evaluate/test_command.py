@@ -303,6 +303,7 @@ def test_report_is_one_page_of_its_own(graph: Path, tmp_path: Path) -> None:
     targets = {ref[1:] for ref in page.references if ref.startswith("#")}
     assert targets <= set(page.ids)
     assert "prefers-color-scheme: dark" in text
+    assert "Reliability of the score" in text
     assert str(tmp_path) not in text
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -120,6 +120,32 @@ def test_the_manifest_and_the_calibration_stand_before_the_first_image(tmp_path:
     assert order[0] == "mushpipe.manifest"
     assert [name for name in order if name in (INFO, COLOR, DEPTH)] == [INFO, COLOR, DEPTH]
     assert metadata(path) == {"mushpipe.manifest": MANIFEST, "mushpipe.summary": {"exit_code": 0}}
+
+
+def test_only_images_that_a_stage_made_are_recorded(tmp_path: Path) -> None:
+    frame = make_frame()
+    bright = replace(frame, color=frame.color // 2 + 100)
+    deep = replace(bright, depth=frame.depth + np.uint16(1))
+    trace = trace_of(frame, bright=bright, same=replace(bright), deep=deep)
+    topics = set(by_topic(record(tmp_path / "all.mcap", [trace])))
+    made = {"/mushpipe/bright/color", "/mushpipe/deep/depth"}
+    assert topics == {COLOR, DEPTH, INFO, "/mushpipe/timing", *made}
+    few = record(tmp_path / "few.mcap", [trace], frames=False)
+    assert set(by_topic(few)) == {"/mushpipe/timing"}
+
+
+def test_lz4_holds_the_same(tmp_path: Path) -> None:
+    traces = [trace_of(make_frame(i), pick=make_picks()) for i in range(3)]
+    paths = [record(tmp_path / f"{how}.mcap", traces, compression=how) for how in ("zstd", "lz4")]
+    zstd, lz4 = (
+        {topic: [row[2].data for row in rows] for topic, rows in by_topic(path).items()}
+        for path in paths
+    )
+    assert zstd == lz4
+    with paths[1].open("rb") as file:
+        assert {chunk.compression for chunk in make_reader(file).get_summary().chunk_indexes} == {
+            "lz4"
+        }
 
 
 def test_every_output_has_a_topic_of_its_own(tmp_path: Path) -> None:

@@ -5,17 +5,18 @@ import pytest
 from pydantic import ValidationError
 
 from mushpipe import Mask
-from mushpipe.stages.hough import Hough, disc_cover, first_of_each_place
+from mushpipe.stages.hough import Hough, HoughSkimage, disc_cover, first_of_each_place
 from tests.stages.scenes import discs, frame_of
 
 TRUTH = [(40.0, 40.0, 15.0), (100.0, 70.0, 20.0), (130.0, 25.0, 12.0)]
 
 
 @pytest.mark.parametrize("source", ["image", "mask"])
-@pytest.mark.parametrize("method", ["alt", "gradient"])
+@pytest.mark.parametrize("method", ["alt", "gradient", "skimage"])
 def test_separate_discs_are_found_once_each(source: str, method: str) -> None:
     image = discs(TRUTH, 0.8, 0.2)
-    stage = Hough(input=source, method=method, votes=10)
+    peer = HoughSkimage(input=source)
+    stage = peer if method == "skimage" else Hough(input=source, method=method, votes=10)
     circles = stage.process(frame_of(image), Mask(image > 0.5))
     found = np.column_stack([circles.center, circles.radius])
     assert len(found) == len(TRUTH)
@@ -25,9 +26,10 @@ def test_separate_discs_are_found_once_each(source: str, method: str) -> None:
     assert (circles.score > 0.9).all()
 
 
-def test_nothing_to_see_gives_no_circles() -> None:
+@pytest.mark.parametrize("stage", [Hough(), HoughSkimage(), HoughSkimage(radius_px=(200, 300))])
+def test_nothing_to_see_gives_no_circles(stage: Hough | HoughSkimage) -> None:
     image = np.full((120, 160), 0.3)
-    assert len(Hough().process(frame_of(image), Mask(image > 0.5))) == 0
+    assert len(stage.process(frame_of(image), Mask(image > 0.5))) == 0
 
 
 def test_a_circle_outside_the_mask_is_not_kept() -> None:

@@ -64,12 +64,26 @@ def test_edges_explained_by_one_circle_support_no_second_one() -> None:
     assert len(found(discs([(80, 60, 22)], 0.8, 0.15), min_score=0.05)) == 1
 
 
-def test_a_tilted_cap_gives_the_circle_of_the_same_area() -> None:
+@pytest.mark.parametrize(("long", "short"), [(23, 19), (25, 19)])
+def test_a_tilted_cap_gives_the_circle_of_the_same_area(long: float, short: float) -> None:
     v, u = np.mgrid[:120, :160].astype(float)
-    level = np.hypot((u - 80) / 23, (v - 60) / 19)
+    level = np.hypot((u - 80) / long, (v - 60) / short)
     image = 0.15 + 0.65 / (1 + np.exp((level - 1) * 18 / 0.4))
     rows = as_rows(found(image))
-    assert rows[0] == pytest.approx((80, 60, np.sqrt(23 * 19)), abs=0.3)
+    assert rows == pytest.approx(np.array([[80, 60, np.sqrt(long * short)]]), abs=0.3)
+
+
+def test_an_overexposed_cap_is_found_and_an_overexposed_bed_holds_none() -> None:
+    rows = as_rows(found(np.minimum(discs([(80, 60, 20)], 3.0, 0.15), 1)))
+    assert rows == pytest.approx(np.array([[80, 60, 20]]), abs=1)
+    assert len(found(np.minimum(discs([(80, 60, 20)], 3.0, 1.5), 1))) == 0
+
+
+def test_noise_holds_no_circle() -> None:
+    rng = np.random.default_rng(0)
+    image = np.clip(rng.normal(0.4, 0.05, (120, 160)), 0, 1)
+    for mask in (np.ones(image.shape, bool), image > 0.4):
+        assert len(PhaseHough().process(frame_of(image), Mask(mask))) == 0
 
 
 @pytest.mark.parametrize("level", [0.0, 0.4, 1.0])
