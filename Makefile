@@ -59,6 +59,20 @@ test-slow: $(STAMP)-dev system-libraries
 verifier: $(STAMP) system-libraries
 	$(BIN)/python -m training.verifier
 
+# The network of `cap-net`, from nothing: frames, three seeds, export, figures. PyTorch for the CPU
+# comes from PyTorch's own index; elsewhere `torch` would bring CUDA along.
+NET := out/net
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
+.PHONY: train
+train: $(STAMP) system-libraries
+	$(BIN)/pip install --quiet --editable '.[train]' --extra-index-url $(TORCH_INDEX)
+	for part in 0 1; do $(BIN)/python -m training.net.scenes --part $$part --of 2 & pids="$$pids $$!"; \
+	  done; for pid in $$pids; do wait $$pid || exit 1; done
+	for seed in 0 1 2; do $(BIN)/python -m training.net.train --seed $$seed --out $(NET)/seed-$$seed.pt && \
+	  $(BIN)/python -m training.net.export --weights $(NET)/seed-$$seed.pt --out $(NET)/seed-$$seed.onnx \
+	  || exit 1; done
+	$(BIN)/python -m training.net.judge --peers --models $(NET)/seed-{0,1,2}.onnx
+
 recordings: $(STAMP) system-libraries
 	$(BIN)/python -m mushpipe.sim.recordings
 

@@ -24,6 +24,7 @@ import skimage
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from mushpipe import Circles, RgbdFrame
+from mushpipe.stages.cap_net import CapNet
 from mushpipe.stages.chan_vese import ChanVese
 from mushpipe.stages.flatten import Flatten
 from mushpipe.stages.hough import Hough
@@ -48,6 +49,13 @@ def chain(segment: ChanVese, detect: PhaseHough | Hough, flat: Flatten | None) -
         return detect.process(frame, opening.process(segment.process(frame)))
 
     return run
+
+
+def network() -> Chain:
+    """Return the learned detector, which needs no segmentation, as one function."""
+    stage = CapNet(radius_px=RADII)
+    stage.open()
+    return lambda frame: stage.process(frame)[1]
 
 
 def fresh(frame: RgbdFrame) -> RgbdFrame:
@@ -115,6 +123,7 @@ def main() -> None:
         "with flatten": (
             chain(ChanVese(), PhaseHough(radius_px=RADII), Flatten()), arguments.repeats,
         ),
+        "cap-net": (network(), arguments.repeats),
     }  # fmt: skip
     print(f"python {platform.python_version()}, numpy {np.__version__}, numba {numba.__version__},")
     print(f"opencv {cv2.__version__}, scikit-image {skimage.__version__}; {platform.processor()}")

@@ -17,6 +17,8 @@ def mushpipe_register(registry: Registry) -> None:
     registry.stage("flatten", "mushpipe.stages.flatten:Flatten")
     registry.stage("opening", "mushpipe.stages.opening:Opening")
     registry.stage("phase-hough", "mushpipe.stages.phase_hough:PhaseHough")
+    registry.stage("cap-net", "mushpipe.stages.cap_net:CapNet")
+    registry.stage("onnx", "mushpipe.stages.onnx_model:Onnx")
     registry.stage("hough", "mushpipe.stages.hough:Hough")
     registry.stage("hough-skimage", "mushpipe.stages.hough:HoughSkimage")
     registry.stage("nearest-depth", "mushpipe.stages.nearest_depth:NearestDepth")

@@ -62,14 +62,19 @@ class Case:
 
 def render(condition: str, family: str, seed: int, cache: Path) -> Case:
     """Return a frame, from the cache folder where it was rendered before."""
-    path = cache / f"{condition}-{family}-{seed}.pickle"
+    settings = CONDITIONS[condition] | {"seed": seed, "shape_family": family, "max_frames": 1}
+    return stored(cache / f"{condition}-{family}-{seed}.pickle", condition, settings)
+
+
+def stored(path: Path, condition: str, settings: dict[str, Any]) -> Case:
+    """Return the frame that settings make, from a file where it was rendered before."""
     if path.exists():
         case: Case = pickle.loads(path.read_bytes())
         return case
-    settings = CONDITIONS[condition] | {"seed": seed, "shape_family": family, "max_frames": 1}
     frame = next(iter(SyntheticSource(**settings).frames()))
+    family, seed = settings["shape_family"], settings["seed"]
     case = Case(condition, family, seed, frame, frame.attached[TRUTH_TOPIC])
-    cache.mkdir(parents=True, exist_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(pickle.dumps(case))
     return case
 

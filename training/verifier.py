@@ -7,39 +7,49 @@ logistic regressions, and again, since features such as `support` depend on what
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import expit
 
 from mushpipe import Circles, Mask, RgbdFrame
 from mushpipe.core.truth import Ignore
+from mushpipe.stages.cap_net import CapNet
 from mushpipe.stages.chan_vese import ChanVese
 from mushpipe.stages.flatten import Flatten
 from mushpipe.stages.opening import Opening
 from mushpipe.stages.otsu import Otsu
 from mushpipe.stages.phase_decide import LIMIT
-from mushpipe.stages.phase_features import IMAGE_FEATURES, NAMES
+from mushpipe.stages.phase_features import DEPTH_FEATURES, IMAGE_FEATURES, LEARNED, NAMES
 from mushpipe.stages.phase_hough import PhaseHough, equal_area_radius
 from mushpipe.stages.verifier import COLUMNS
 from training.matching import IOU, circle_iou
+from training.net.scenes import varied_cases
 from training.scenes import Case, training_cases
 
 Floats = NDArray[np.float64]
 RADII = (8.0, 45.0)
+Prepared = tuple[Case, RgbdFrame, Mask, Circles | None]
+VARIED = 20  # frames
+NET = CapNet(radius_px=RADII, min_score=0.05)  # what it is unsure of is for the verifier to decide
 MODELS: dict[str, dict[str, Any]] = {
     "image": {"use_depth": False},
     "depth": {"use_depth": True},
     "mask": {"input": "mask"},
+    "image_learned": {"use_depth": False},
+    "depth_learned": {"use_depth": True},
 }
 FEATURES = {
     "image": tuple(IMAGE_FEATURES),
-    "depth": NAMES,
+    "depth": (*IMAGE_FEATURES, *DEPTH_FEATURES),
     "mask": tuple(name for name in IMAGE_FEATURES if name not in ("cover", "texture")),
+    "image_learned": (*IMAGE_FEATURES, LEARNED),
+    "depth_learned": NAMES,
 }
 # An ignored mushroom of these kinds is a cap all the same, or is surely none.
 RIGHT, WRONG = (Ignore.AT_BORDER, Ignore.TOO_LARGE), (Ignore.CUT_STUMP,)
@@ -57,6 +67,20 @@ def segmentations(frame: RgbdFrame) -> list[tuple[RgbdFrame, Mask]]:
         (flat, opening.process(ChanVese().process(flat))),
         (frame, opening.process(Otsu().process(frame))),
     ]
+
+
+def prepared(cache: Path) -> Iterator[Prepared]:
+    """Yield the frames of the training, without and with the circles of `cap-net`.
+
+    What is learnt beside `cap-net` is learnt on varied frames as well, as that is what it is for.
+    """
+    for case in training_cases(cache):
+        for number, (frame, mask) in enumerate(segmentations(case.frame)):
+            yield case, frame, mask, None
+            if number == 0:
+                yield case, frame, mask, NET.process(case.frame)[1]
+    for case in varied_cases(cache, "a", VARIED):
+        yield case, *segmentations(case.frame)[0], NET.process(case.frame)[1]
 
 
 def labels(case: Case, circles: Circles, order: NDArray[np.intp]) -> Floats:
@@ -87,13 +111,11 @@ def labels(case: Case, circles: Circles, order: NDArray[np.intp]) -> Floats:
     return result
 
 
-def samples(
-    stage: PhaseHough, cases: Iterable[tuple[Case, RgbdFrame, Mask]], depth: bool
-) -> tuple[Floats, Floats]:
+def samples(stage: PhaseHough, cases: Iterable[Prepared], depth: bool) -> tuple[Floats, Floats]:
     """Return features (N, F) and labels (N,) of all candidates of a pass over the scenes."""
     rows, right = [np.zeros((0, len(NAMES)))], [np.zeros(0)]
-    for case, frame, mask in cases:
-        found = stage.gather(frame, mask)
+    for case, frame, mask, learned in cases:
+        found = stage.gather(frame, mask, learned)
         if found is None or not len(found.shapes):
             continue
         order, chance, _ = stage.decide(found)
@@ -148,19 +170,19 @@ def write(models: dict[str, Any], path: Path) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def train(cache: Path, out: Path, rounds: int, ridge: float) -> None:
-    """Train all models and write them."""
-    cases = [
-        (case, frame, mask)
-        for case in training_cases(cache)
-        for frame, mask in segmentations(case.frame)
-    ]
-    models = {name: first_guess() for name in MODELS}
+def train(cache: Path, out: Path, rounds: int, ridge: float, names: list[str]) -> None:
+    """Train the models of these names and write them, beside the others that the file has."""
+    cases = [*prepared(cache)]
+    kept = yaml.safe_load(out.read_text(encoding="utf-8"))["models"] if out.exists() else {}
+    models = {name: first_guess() for name in MODELS} | kept
+    models |= {name: first_guess() for name in names}
     write(models, out)
     for turn in range(rounds):
-        for name, settings in MODELS.items():
-            stage = PhaseHough(radius_px=RADII, verifier=out, **settings)
-            features, right = samples(stage, cases, name == "depth")
+        for name in names:
+            stage = PhaseHough(radius_px=RADII, verifier=out, **MODELS[name])
+            beside = name.endswith("learned")
+            chosen = [case for case in cases if (case[3] is not None) == beside]
+            features, right = samples(stage, chosen, name.startswith("depth"))
             models[name] = fit(features, right, FEATURES[name], ridge)
             print(f"round {turn + 1}, {name}: {len(right)} candidates, {right.mean():.2f} right")
         write(models, out)
@@ -173,8 +195,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("mushpipe/stages/verifier.yaml"))
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--ridge", type=float, default=1e-3)
+    parser.add_argument("--models", nargs="+", default=list(MODELS), choices=MODELS)
     arguments = parser.parse_args()
-    train(arguments.cache, arguments.out, arguments.rounds, arguments.ridge)
+    names = arguments.models
+    train(arguments.cache, arguments.out, arguments.rounds, arguments.ridge, names)
 
 
 if __name__ == "__main__":

@@ -44,6 +44,15 @@ def import_realsense() -> Any:
     return _import("pyrealsense2")
 
 
+def import_onnxruntime() -> Any:
+    """Import onnxruntime.
+
+    Raises:
+        DependencyError: It is not installed, or a system library is missing.
+    """
+    return _import("onnxruntime")
+
+
 def _import(name: str) -> Any:
     try:
         return importlib.import_module(name)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -25,6 +25,7 @@ class Ground:
         height: (H, W) m.
         albedo: (H, W, 3) linear RGB.
         material: How it is painted.
+        wet: 0..1, how much it gleams.
     """
 
     area: Area
@@ -32,6 +33,7 @@ class Ground:
     height: Singles
     albedo: Singles
     material: Material
+    wet: float = 0.0
 
     def texels(self, points: Reals) -> tuple[Singles, Singles]:
         """Return the column and row (N,) of points (N, 2) m."""
@@ -103,6 +105,19 @@ def soil(
     albedo = mix(albedo.reshape(-1, 3), (*white,), cover.ravel()).reshape(albedo.shape)
     height = height + 0.0007 * cover
     return Ground(area, texel, height.astype(np.float32), albedo, Material.SOIL)
+
+
+def weathered(ground: Ground, relief: float, wet: float, rng: np.random.Generator) -> Ground:
+    """Return soil with lumps of a standard deviation `relief` (m), wet to a degree of 0..1."""
+    shape, texel = ground.height.shape, ground.texel
+    lumps = blurred(rng, shape, rng.uniform(0.008, 0.02) / texel)
+    lumps = lumps + 0.5 * blurred(rng, shape, 0.004 / texel)
+    puddles = smoothstep(-1.0, 1.0, blurred(rng, shape, 0.03 / texel))
+    albedo = ground.albedo * (1 - 0.65 * wet * puddles)[..., None]
+    height = ground.height + relief * lumps
+    return replace(
+        ground, height=height.astype(np.float32), albedo=albedo.astype(np.float32), wet=wet
+    )
 
 
 def _fibres(albedo: Singles, texel: float, area: Area, rng: np.random.Generator) -> None:
@@ -186,6 +201,20 @@ def litter(ground: Ground, area: Area, density: float, rng: np.random.Generator)
         z = ground.height_at(flat) + radius * rng.uniform(-0.2, 0.5, len(flat))
         spots = np.column_stack([flat, z])
         pieces += _scatter(_lumps(rng, rings, material), spots, radius, rng)
+    return pieces
+
+
+def rubble(
+    ground: Ground, area: Area, count: int, pixel: float, rng: np.random.Generator
+) -> list[Mesh]:
+    """Scatter clods, stones and overgrown lumps of 5 to 20 pixels (m each), as large as caps."""
+    pieces = []
+    kinds = ((0.55, Material.CLOD), (0.3, Material.STONE), (0.15, Material.MYCELIUM))
+    for share, material in kinds:
+        flat = area.draw(rng, round(share * count))
+        radius = pixel * np.exp(rng.uniform(np.log(5), np.log(20), len(flat)))
+        z = ground.height_at(flat) + radius * rng.uniform(-0.3, 0.5, len(flat))
+        pieces += _scatter(_lumps(rng, 15, material), np.column_stack([flat, z]), radius, rng)
     return pieces
 
 

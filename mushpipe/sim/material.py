@@ -84,6 +84,7 @@ class Painter:
             make = self._makers.get(material, self._even)
             albedo[rows] = make(surface, rows)
         gloss = _GLOSS[surface.material]
+        gloss[surface.material <= Material.CLOD] += np.float32(0.4 * self._world.ground.wet)
         cap = np.flatnonzero(surface.material == Material.CAP)
         gloss[cap] = self._gloss[surface.owner[cap]]
         return Paint(np.clip(albedo, 0.002, 0.95), gloss, self._relief(surface))

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from mushpipe.sim.mushroom import Kind, Mushroom
-from mushpipe.sim.noise import Floats
+from mushpipe.sim.noise import Floats, generator
 from mushpipe.sim.settings import SceneSettings
-from mushpipe.sim.shapes import CapShape, Warp, draw_shape
+from mushpipe.sim.shapes import CapShape, Warp, deformed, draw_shape
 
 _TINTS = {
     "white": (0.83, 0.80, 0.735),
@@ -82,8 +82,9 @@ def plant(
 
 def _seat(settings: SceneSettings, area: Area, share: float, rng: np.random.Generator) -> _Seats:
     lab = settings.scene == "lab"
-    wanted = [(Kind.PRINTED if lab else Kind.GROWING, settings.count)]
-    if not lab:
+    printed = lab and settings.printed
+    wanted = [(Kind.PRINTED if printed else Kind.GROWING, settings.count)]
+    if not printed:
         wanted += [(Kind.STUMP, settings.stumps), (Kind.FALLEN, settings.fallen)]
         wanted += [(Kind.PIN, settings.pins)]
     kind = [k for k, number in wanted for _ in range(round(number * share))]
@@ -162,6 +163,8 @@ def _grow(
     height = float(seats.height[row])
     bend = min(0.75 * height, 0.9 * radius) if kind != Kind.FALLEN else 0.0
     spot = place - bend * axis[:2]
+    if settings.lean and kind == Kind.GROWING:
+        spot = spot - settings.lean * _lean(settings.seed, row, radius)
     foot = np.array([*spot, float(ground(spot[None])[0])])
     center = np.array([*place, foot[2] + height])
     age = rng.beta(1.6, 1.8) if kind in (Kind.GROWING, Kind.FALLEN) else 0.2
@@ -189,8 +192,17 @@ def _grow(
     )
 
 
+def _lean(seed: int, row: int, radius: float) -> Floats:
+    """Return how much farther (2,) m than its bend a stem may lean: up to 1.5 cap radii."""
+    rng = generator(seed, "lean", row)
+    turn, far = rng.uniform(0, 2 * np.pi), 1.5 * radius * rng.uniform(0, 1)
+    return np.array([np.cos(turn), np.sin(turn)]) * far
+
+
 def _shape(settings: SceneSettings, kind: Kind, age: float, rng: np.random.Generator) -> CapShape:
     shape = draw_shape(rng, settings.shape_family, age)
+    if settings.deform:
+        shape = deformed(shape, settings.deform, rng)
     if kind == Kind.PRINTED:  # one CAD model, a little different in print
         return CapShape(shape.family, shape.height, shape.form, shape.lip, shape.curl, True, Warp())
     return shape

@@ -41,8 +41,23 @@ class SceneSettings(BaseModel):
     pins: int = Field(40, ge=0, le=300, description="mushrooms too small to pick, in view, about")
     stumps: int = Field(1, ge=0, le=40, description="stems left by a cut, in view, about")
     fallen: int = Field(0, ge=0, le=40, description="caps lying on their side, in view, about")
+    lean: float = Field(0, ge=0, le=1, description="how far stems lean and show beside their caps")
+    deform: float = Field(
+        0, ge=0, le=1, description="departure of caps from their family; 0: as the family has it"
+    )
+    printed: bool = Field(
+        True, description="the lab's mushrooms are printed ones; else real ones, cut"
+    )
     mycelium: float = Field(0.5, ge=0, le=1, description="white threads, patches and primordia")
     soil: float = Field(1, ge=0.2, le=6, description="brightness of the soil; dry soil is 2 to 4")
+    wet: float = Field(0, ge=0, le=1, description="wet soil: darker and glossy")
+    relief_mm: float = Field(
+        0, ge=0, le=10, description="lumps of the soil, standard deviation of its height, mm"
+    )
+    rubble: int = Field(
+        0, ge=0, le=300, description="clods and stones as large as caps, in view, about"
+    )
+    foreign: int = Field(0, ge=0, le=20, description="papers, boxes, cups and rails on the bed")
     tray: bool = Field(False, description="show the rim of the tray at the left")
     table: Literal["wood", "cloth", "paint"] = Field("wood", description="table of the lab scene")
     clutter: int = Field(4, ge=0, le=20, description="papers, boxes and cups on the lab's table")

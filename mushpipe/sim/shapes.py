@@ -7,7 +7,7 @@ Lengths of a shape are in units of its rim radius.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -71,6 +71,21 @@ def draw_shape(rng: np.random.Generator, family: Family, age: float) -> CapShape
         height = np.clip(0.72 - 0.35 * age + rng.normal(0, 0.05), 0.3, 0.8)
         lip, curl = rng.uniform(0.02, 0.3), 0.35 - 0.2 * age
     return CapShape(family, float(height), form, lip, curl, age < 0.45, draw_warp(rng, age))
+
+
+def deformed(shape: CapShape, amount: float, rng: np.random.Generator) -> CapShape:
+    """Return a cap that is no longer quite of its family: `amount` 1 is a third of its form."""
+    stretch, bend = np.exp(amount * rng.normal(0, (0.25, 0.2)))
+    warp, grow = shape.warp, 1 + 2 * amount * rng.random()
+    oval = (float(rng.normal(0, 0.05 * amount)), 2, float(rng.uniform(0, 2 * np.pi)))
+    bumps = tuple((grow * a, order, phase) for a, order, phase in warp.bumps)
+    shear = tuple(s + float(rng.normal(0, 0.12 * amount)) for s in warp.shear)
+    return replace(
+        shape,
+        height=float(np.clip(shape.height * stretch, 0.25, 1.2)),
+        form=tuple(float(f * bend) for f in shape.form),
+        warp=replace(warp, rim=(*warp.rim, oval), bumps=bumps, shear=(shear[0], shear[1])),
+    )
 
 
 def draw_warp(rng: np.random.Generator, age: float) -> Warp:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 
@@ -98,6 +100,32 @@ def clutter(count: int, area: Area, keep: Floats, rng: np.random.Generator) -> l
         turn = rng.uniform(0, 2 * np.pi)
         things.append(thing.placed(about_z(turn), np.array([*spot, 0.0012])))
     return things
+
+
+def foreign(
+    count: int,
+    area: Area,
+    keep: Floats,
+    ground: Callable[[Floats], Floats],
+    rng: np.random.Generator,
+) -> list[Mesh]:
+    """Return clutter and rails on a ground of a height (N,) m at points (N, 2) m; else as there."""
+    things = []
+    for thing in clutter(count, area, keep, rng):
+        spot = thing.vertices[:, :2].mean(axis=0)
+        lift = np.array([0.0, 0.0, float(ground(spot[None])[0]) + 0.002])
+        things.append(thing.placed(np.eye(3), lift))
+        if rng.random() < 0.25:
+            things.append(_rail(area, rng))
+    return things
+
+
+def _rail(area: Area, rng: np.random.Generator) -> Mesh:
+    """A bar of metal or plastic across the whole view, on the bed or above it."""
+    kind = (Material.METAL, Material.PLASTIC)[rng.integers(2)]
+    bar = box((4.0, *rng.uniform(0.006, 0.03, 2)), kind)
+    turn = rng.integers(2) * np.pi / 2 + rng.normal(0, 0.05)
+    return bar.placed(about_z(turn), np.array([*area.draw(rng, 1)[0], rng.uniform(0.0, 0.05)]))
 
 
 def _paper(rng: np.random.Generator, number: int) -> Mesh:

@@ -107,12 +107,15 @@ def make_world(settings: SceneSettings, travel: float = 0.0) -> World:
     texel = 0.75 * settings.pixel()
     if settings.scene == "bed":
         base = grounds.soil(wide, texel, settings.soil, settings.mycelium, rng)
+        if settings.relief_mm or settings.wet:
+            weather = generator(settings.seed, "relief")
+            base = grounds.weathered(base, settings.relief_mm / 1000, settings.wet, weather)
     elif settings.scene == "lab":
         base = tables.table(settings.table, wide, texel, rng)
     else:
         base = tables.target(wide, texel)
     mushrooms = _mushrooms(settings, view, share, base)
-    things = _things(settings, view, base, mushrooms, rng)
+    things = _things(settings, view, share, base, mushrooms, rng)
     step = 3.4 if settings.scene == "bed" else 6.0
     return assemble(
         base, mushrooms, [base.mesh(step * settings.pixel()), *things], settings.pixel()
@@ -131,6 +134,7 @@ def _mushrooms(settings: SceneSettings, view: Area, share: float, base: Ground) 
 def _things(
     settings: SceneSettings,
     view: Area,
+    share: float,
     base: Ground,
     mushrooms: list[Mushroom],
     rng: np.random.Generator,
@@ -143,6 +147,11 @@ def _things(
     if settings.scene == "bed":
         things += grounds.litter(base, view.grown(0.02), 1500.0, rng)
         things += grounds.primordia(base, feet, settings.mycelium, view, rng)
+        count, pixel = round(settings.rubble * share), settings.pixel()
+        stones = generator(settings.seed, "rubble")
+        things += grounds.rubble(base, view.grown(0.02), count, pixel, stones)
+        strange = generator(settings.seed, "foreign")
+        things += tables.foreign(settings.foreign, view, feet, base.height_at, strange)
         if settings.tray:
             things += grounds.tray_rim(view.x0 + 0.09 * (view.x1 - view.x0), view.grown(0.3))
     return things

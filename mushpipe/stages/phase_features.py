@@ -44,7 +44,8 @@ DEPTH_FEATURES = {
     "rise": "share of the known outline outside which it is higher by a step",
     "gap": "share of the disc without depth",
 }
-NAMES = (*IMAGE_FEATURES, *DEPTH_FEATURES)
+LEARNED = "learned"  # what circles of another detector say; see `phase_learned`
+NAMES = (*IMAGE_FEATURES, *DEPTH_FEATURES, LEARNED)
 FIRST_STATIC = list(NAMES).index("residual")
 FIRST_DEPTH = len(IMAGE_FEATURES)
 SAMPLES = 16  # directions in which the disc is sampled

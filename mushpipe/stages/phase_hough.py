@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 
-from mushpipe import Circles, Mask, RgbdFrame, Stage
+from mushpipe import Circles, InputError, Mask, RgbdFrame, Stage
 from mushpipe.core.stage import GraphPath
 from mushpipe.stages.phase_decide import decide, polish
 from mushpipe.stages.phase_depth import NO_RELIEF, Relief, relief_of
@@ -23,8 +23,9 @@ from mushpipe.stages.phase_edges import (
     gradient_of,
     otsu_of,
 )
-from mushpipe.stages.phase_features import static_features
+from mushpipe.stages.phase_features import LEARNED, NAMES, static_features
 from mushpipe.stages.phase_fuse import fused
+from mushpipe.stages.phase_learned import agreement, candidates_of, discs_of
 from mushpipe.stages.phase_refit import Table, refit
 from mushpipe.stages.phase_votes import CELL, peaks, rings_between, summed, vote
 from mushpipe.stages.verifier import Verifier, load_verifier
@@ -51,6 +52,7 @@ class Evidence:
         middle: (N,) m height of the middle over the bed, NaN without depth.
         height: (h, w) m over the bed at half resolution, empty without depth.
         pixel: Size of a pixel on the bed, m.
+        learned: Whether another detector was asked.
     """
 
     edges: Edges
@@ -60,6 +62,7 @@ class Evidence:
     middle: Table
     height: Plane
     pixel: float
+    learned: bool
 
 
 class PhaseHough(Stage):
@@ -89,6 +92,9 @@ class PhaseHough(Stage):
         0.07, ge=0.01, le=1, description="least share of an outline that votes, for a candidate"
     )
     use_depth: bool = Field(True, description="false ignores depth")
+    use_learned: bool = Field(
+        False, description="take the circles of the `cap-net` above: as candidates, and as evidence"
+    )
     verifier: GraphPath | None = Field(None, description="another verifier than the package's")
 
     _verifier: Verifier | None = PrivateAttr(None)
@@ -106,9 +112,20 @@ class PhaseHough(Stage):
         self._load()
         self._warm_up()
 
-    def process(self, frame: RgbdFrame, mask: Mask) -> Circles:
-        """Return the circles, the most certain first."""
-        found = self.gather(frame, mask)
+    def process(self, frame: RgbdFrame, mask: Mask, learned: Circles | None = None) -> Circles:
+        """Return the circles, the most certain first.
+
+        Args:
+            frame: The image, and depth where there is one.
+            mask: Where caps may be.
+            learned: Circles of `cap-net`; ignored unless `use_learned`.
+
+        Raises:
+            InputError: `use_learned`, and there are no circles.
+        """
+        if self.use_learned and learned is None:
+            raise InputError("use_learned needs a stage above that finds circles, such as cap-net")
+        found = self.gather(frame, mask, learned if self.use_learned else None)
         if found is None:
             return Circles(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
         order, chance, owner = self.decide(found)
@@ -116,7 +133,9 @@ class PhaseHough(Stage):
         polish(found.edges, found.height, found.pixel, shapes, owner)
         return Circles(shapes[:, :2], equal_area_radius(shapes), chance[order])
 
-    def gather(self, frame: RgbdFrame, mask: Mask) -> Evidence | None:
+    def gather(
+        self, frame: RgbdFrame, mask: Mask, learned: Circles | None = None
+    ) -> Evidence | None:
         """Return candidates with their features; None where an image cannot hold a circle."""
         height, width = mask.foreground.shape
         if min(height, width) < _SMALLEST:
@@ -127,27 +146,40 @@ class PhaseHough(Stage):
         image = _levels(frame, mask, literal)
         gradient = gradient_of(image)
         foreground = _foreground(mask, relief)
+        if learned is not None:
+            foreground = foreground | discs_of(learned, foreground.shape)
         region = np.ones_like(foreground) if literal else cv2.dilate(foreground, _AROUND)
         edges = self._edges(image, gradient, np.asarray(region, np.uint8), relief)
         cells = vote(
             edges, rings_between(smallest, largest), (-(-height // CELL), -(-width // CELL))
         )
         found = peaks(*summed(cells), self.evidence, smallest, largest, _REACH)
+        if learned is not None:
+            found = np.concatenate([found, candidates_of(learned, smallest, largest)])
         high, pixel = (relief.height, relief.pixel) if relief else (NO_RELIEF, 0.0)
         shapes, hits, residual = refit(edges, high, pixel, found, smallest, largest)
         table, middle = static_features(
             image, gradient, mask.foreground.view(np.uint8), high, pixel, shapes, hits, residual
         )
+        if learned is not None:
+            table[:, NAMES.index(LEARNED)] = agreement(shapes, equal_area_radius(shapes), learned)
         kept = self._plausible(shapes, middle, relief)
-        return Evidence(edges, shapes[kept], hits[kept], table[kept], middle[kept], high, pixel)
+        return Evidence(
+            edges, shapes[kept], hits[kept], table[kept], middle[kept], high, pixel,
+            learned is not None,
+        )  # fmt: skip
 
     def decide(self, found: Evidence) -> tuple[Rows, Table, Rows]:
         """Return the accepted rows in their order, all probabilities, and whose each edge is."""
         verifier = self._load()
-        plain = verifier.mask if self.input == "mask" else verifier.image
+        plain, deep = verifier.image, verifier.depth
+        if self.input == "mask":
+            plain = verifier.mask
+        elif found.learned:
+            plain, deep = verifier.image_learned, verifier.depth_learned
         known = np.isfinite(found.middle)
         return decide(
-            found.edges, found.shapes, found.hits, found.table, known, plain, verifier.depth,
+            found.edges, found.shapes, found.hits, found.table, known, plain, deep,
             self.min_score,
         )  # fmt: skip
 
@@ -190,10 +222,11 @@ class PhaseHough(Stage):
         from mushpipe import Camera, Header
 
         camera = Camera(96, 96, 100.0, 100.0, 47.5, 47.5)
+        learned = Circles(np.array([[48.0, 48.0]]), np.array([20.0]), np.ones(1))
         for native in (np.uint16, np.float32):
             depth = (500 - 20 * disc).astype(native)
             frame = RgbdFrame(Header(0, 0, "warm-up"), color, depth, 0.001, camera)
-            self.process(frame, Mask(disc))
+            self.process(frame, Mask(disc), learned)
 
 
 def equal_area_radius(shapes: Table) -> Table:

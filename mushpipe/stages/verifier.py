@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,8 @@ COLUMNS = ("mean", "scale", "weight", "square")
 class Verifier:
     """Weights of the models ``image``, ``depth`` and ``mask``, each (F + 1, 4).
 
+    ``image_learned`` and ``depth_learned`` are for candidates beside another detector's circles.
+
     Row k holds mean, scale, weight and weight of the square of feature k, the last row the
     intercept as its weight. A feature that a model does not name has no weight in it.
     """
@@ -31,6 +33,8 @@ class Verifier:
     image: Table
     depth: Table
     mask: Table
+    image_learned: Table
+    depth_learned: Table
 
 
 def load_verifier(path: Path | None = None) -> Verifier:
@@ -41,7 +45,7 @@ def load_verifier(path: Path | None = None) -> Verifier:
     """
     text = (path or resources.files("mushpipe.stages") / FILE).read_text(encoding="utf-8")
     content = yaml.safe_load(text)
-    missing = {"image", "depth", "mask"} - set(content["models"])
+    missing = {field.name for field in fields(Verifier)} - set(content["models"])
     if missing:
         raise ValueError(f"the verifier lacks the models {sorted(missing)}")
     return Verifier(**{name: weights_of(model) for name, model in content["models"].items()})

@@ -14,6 +14,7 @@ from tests.proof.goldens import CASES, FOLDER, GRAPHS, RECORDINGS, ROOT, Case, r
 # Built-in plugins that no recording can show, each with the tests that stand in.
 ELSEWHERE = {
     "realsense": "tests/live",  # needs librealsense's software device
+    "onnx": "tests/stages/test_onnx_model.py",  # the model is the user's own
     "foxglove": "tests/io/test_foxglove.py",  # it keeps nothing
     "stream": "tests/cli/test_stream.py",  # it reads a pipe
     "synthetic": "tests/sim",  # it is what the recordings were made with

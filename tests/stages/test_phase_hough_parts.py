@@ -259,7 +259,8 @@ def test_the_verifier_of_the_package_names_known_features_only() -> None:
 def test_a_verifier_with_an_unknown_feature_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "verifier.yaml"
     model = "{intercept: 0, features: {luck: {mean: 0, scale: 1, weight: 1, square: 0}}}"
-    path.write_text(f"models: {{image: {model}, depth: {model}, mask: {model}}}")
+    names = ("image", "depth", "mask", "image_learned", "depth_learned")
+    path.write_text(f"models: {{{', '.join(f'{name}: {model}' for name in names)}}}")
     with pytest.raises(ValueError, match="unknown features"):
         load_verifier(path)
     path.write_text("models: {}")

@@ -1,0 +1,52 @@
+"""From the maps of `cap-net` to circles: peaks of the heat, then one circle per cap.
+
+After CenterNet (Zhou, Wang & Kraehenbuehl 2019, arXiv 1904.07850, section 4.1): a cell is a peak
+where it is the largest of its 3x3 neighbourhood.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mushpipe.evaluate.matching import circle_iou
+
+Floats = NDArray[np.float64]
+Maps = NDArray[np.float32]
+STRIDE = 4
+HEAT, MASK, RADIUS, OFFSET = 0, 1, 2, slice(3, 5)
+CHANNELS = 5
+_MOST = 600  # peaks; more caps than that do not fit into an image
+
+
+def circles_of(maps: Maps, least: float) -> tuple[Floats, Floats]:
+    """Return circles (N, 3) px and scores (N,), the most certain first.
+
+    Args:
+        maps: (5, h, w): logits of heat and mask, log(radius / STRIDE), and the way from a cell to
+            the centre in x and y, in cells.
+        least: Smallest score.
+    """
+    heat = maps[HEAT]
+    limit = np.log(least / (1 - least)) if 0 < least < 1 else (-np.inf if least <= 0 else np.inf)
+    highest = np.asarray(cv2.dilate(heat, np.ones((3, 3), np.uint8)))
+    row, column = np.nonzero((heat >= highest) & (heat > limit))
+    order = np.argsort(-heat[row, column], kind="stable")[:_MOST]
+    row, column = row[order], column[order]
+    at = maps[:, row, column].astype(np.float64)
+    # the middle of cell k is pixel STRIDE (k + 1/2) - 1/2
+    cells = np.stack([column, row]) + np.clip(at[OFFSET], -2, 2) + 0.5
+    radius = STRIDE * np.exp(np.clip(at[RADIUS], -3, 6))
+    circles = np.column_stack([*(STRIDE * cells - 0.5), radius])
+    return circles, 1 / (1 + np.exp(-at[HEAT]))
+
+
+def first_of_each(circles: Floats, overlap: float) -> NDArray[np.intp]:
+    """Return the rows of circles (N, 3) that overlap no kept row before by more than an IoU."""
+    iou = circle_iou(circles[:, :2], circles[:, 2], circles[:, :2], circles[:, 2])
+    free = np.ones(len(circles), bool)
+    for row in range(len(circles)):
+        if free[row]:
+            free[row + 1 :] &= iou[row, row + 1 :] <= overlap
+    return np.flatnonzero(free)

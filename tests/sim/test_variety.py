@@ -1,0 +1,85 @@
+"""What a detector is trained against: each setting does what it says, and nothing when off."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mushpipe.sim.ground import rubble, soil, weathered
+from mushpipe.sim.mesh import Material
+from mushpipe.sim.mushroom import Kind
+from mushpipe.sim.planting import Area
+from mushpipe.sim.settings import SceneSettings
+from mushpipe.sim.shapes import deformed, draw_shape
+from mushpipe.sim.world import World, make_world
+
+AREA = Area(-0.1, 0.1, -0.08, 0.08)
+
+
+def world(**settings: Any) -> World:
+    small: dict[str, Any] = {"width": 160, "height": 120, "count": 12, "pins": 5, **settings}
+    return make_world(SceneSettings(**small))
+
+
+def test_relief_adds_its_standard_deviation_and_wet_soil_is_darker() -> None:
+    flat = soil(AREA, 0.0006, 1.0, 0.5, np.random.default_rng(1))
+    lumpy = weathered(flat, 0.004, 0.0, np.random.default_rng(2))
+    # lumps of two sizes, of standard deviation 1 and a half
+    assert (lumpy.height - flat.height).std() == pytest.approx(0.004 * np.sqrt(1.25), rel=0.05)
+    assert np.array_equal(lumpy.albedo, flat.albedo)
+    wet = weathered(flat, 0.0, 1.0, np.random.default_rng(2))
+    assert 0.35 < wet.albedo.mean() / flat.albedo.mean() < 0.9
+    assert np.array_equal(wet.height, flat.height)
+
+
+def test_rubble_is_as_large_as_small_caps() -> None:
+    ground, pixel = soil(AREA, 0.0006, 1.0, 0.0, np.random.default_rng(1)), 0.0008
+    pieces = rubble(ground, AREA, 100, pixel, np.random.default_rng(3))
+    assert len(pieces) == 100
+    assert {p.material for p in pieces} == {Material.CLOD, Material.STONE, Material.MYCELIUM}
+    radius = [np.ptp(p.vertices[:, :2], axis=0).mean() / 2 / pixel for p in pieces]
+    assert 3 < min(radius) < 8
+    assert 12 < max(radius) < 32
+
+
+def test_what_lies_on_the_bed_moves_no_mushroom() -> None:
+    plain, full = world(), world(rubble=60, foreign=5)
+    assert len(full.triangles) > len(plain.triangles)
+    for a, b in zip(plain.mushrooms, full.mushrooms, strict=True):
+        assert np.array_equal(a.center, b.center)
+        assert np.array_equal(a.foot, b.foot)
+
+
+def test_leaning_stems_stand_farther_out_under_the_same_caps() -> None:
+    plain, leaning = world(), world(lean=1.0)
+    assert len(plain.mushrooms) == len(leaning.mushrooms)
+    moved = []
+    for a, b in zip(plain.mushrooms, leaning.mushrooms, strict=True):
+        assert np.array_equal(a.center[:2], b.center[:2])
+        assert np.array_equal(a.axis, b.axis)
+        away = np.linalg.norm((b.foot - a.foot)[:2]) / a.radius
+        assert away <= 1.5
+        moved += [away] if a.kind == Kind.GROWING else []
+    assert max(moved) > 0.7
+
+
+def test_a_deformed_cap_keeps_its_family_and_its_rim_plane() -> None:
+    rng = np.random.default_rng(4)
+    for _ in range(50):
+        shape = draw_shape(rng, "a", 0.5)
+        other = deformed(shape, 1.0, rng)
+        assert other.family == shape.family
+        assert 0.25 <= other.height <= 1.2
+        assert replace(other, height=shape.height, form=shape.form, warp=shape.warp) == shape
+
+
+def test_real_mushrooms_lie_on_a_table_where_asked_for() -> None:
+    printed = world(scene="lab", fallen=2)
+    assert {m.kind for m in printed.mushrooms} == {Kind.PRINTED}
+    real = world(scene="lab", printed=False, fallen=2, stumps=0, pins=0)
+    kinds = [m.kind for m in real.mushrooms]
+    assert kinds.count(Kind.GROWING) == 12
+    assert kinds.count(Kind.FALLEN) == 2

@@ -1,0 +1,111 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from mushpipe import RgbdFrame
+from mushpipe.core.errors import UsageError
+from mushpipe.core.recording import RecordingReader
+from mushpipe.core.truth import INSTANCES_TOPIC, TRUTH_TOPIC, Truth
+from mushpipe.core.wire import decode_table
+from mushpipe.sources.mcap import McapSource
+from mushpipe.stages.cap_net import KIND, CapNet
+from tests.stages.frames import iou, simulated
+from tests.stages.networks import answering
+from tests.stages.scenes import HEADER
+from training.matching import Score, counted
+
+RECORDINGS = Path(__file__).parents[2] / "recordings"
+
+
+def first(name: str) -> RgbdFrame:
+    return next(iter(McapSource(path=RECORDINGS / f"{name}.mcap").frames()))
+
+
+def truth_of(name: str) -> Truth:
+    messages = RecordingReader(RECORDINGS / f"{name}.mcap").messages({TRUTH_TOPIC})
+    raw = next(iter(messages))
+    table = decode_table(raw.schema.name, raw.message.data).table
+    assert isinstance(table, Truth)
+    return table
+
+
+@pytest.mark.parametrize(
+    ("name", "least"),
+    [("first-bed", 0.9), ("dense", 0.9), ("brown", 0.85), ("tilted", 0.85), ("harsh-light", 0.85)],
+)
+def test_caps_of_scenes_it_never_saw_are_found(name: str, least: float) -> None:
+    stage, truth, score = CapNet(), truth_of(name), Score()
+    score.add(stage.process(first(name))[1], truth, counted(truth, *stage.radius_px))
+    assert score.f >= least
+
+
+def test_the_mask_is_where_the_caps_are() -> None:
+    frame = simulated(31, width=640, height=480, count=60)
+    truth, labels = frame.attached[TRUTH_TOPIC], frame.attached[INSTANCES_TOPIC].labels
+    mask, _ = CapNet().process(frame)
+    caps = np.isin(labels, 1 + np.flatnonzero(truth.radius >= 8))
+    assert iou(mask.foreground, caps) > 0.75
+
+
+def test_a_range_of_larger_caps_is_met_by_scaling_the_image() -> None:
+    frame = first("first-bed")
+    size = (2 * frame.color.shape[1], 2 * frame.color.shape[0])
+    twice = RgbdFrame(HEADER, cv2.resize(frame.color, size, interpolation=cv2.INTER_CUBIC))
+    stage = CapNet(radius_px=(12, 45))
+    assert stage.scale() == 1
+    large = CapNet(radius_px=(24, 90))
+    assert large.scale() < 1
+    (_, circles), (mask, found) = stage.process(frame), large.process(twice)
+    assert mask.foreground.shape == (960, 1280)
+    # near the ends of the range a circle may be in one answer and not in the other
+    sure = (circles.score > 0.8) & (circles.radius > 14) & (circles.radius < 40)
+    center, radius = 2 * circles.center[sure] + 0.5, 2 * circles.radius[sure]
+    away = np.linalg.norm(center[:, None] - found.center[None], axis=2)
+    near = away.min(axis=1) < 5
+    assert near.mean() > 0.9
+    ratio = found.radius[away.argmin(axis=1)[near]] / radius[near]
+    assert np.median(ratio) == pytest.approx(1, rel=0.04)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (5, 70), (33, 65), (130, 31), (240, 320)])
+def test_an_image_of_any_size_gives_a_mask_of_its_size(shape: tuple[int, int]) -> None:
+    noise = np.random.default_rng(1).integers(0, 256, (*shape, 3), np.uint8)
+    mask, circles = CapNet(min_score=0.0).process(RgbdFrame(HEADER, noise))
+    assert mask.foreground.shape == shape
+    assert (circles.center >= -0.5).all()
+    assert (circles.center < np.array(shape[::-1]) - 0.5).all()
+
+
+def test_an_empty_bed_has_no_caps() -> None:
+    frame = simulated(21, count=0, pins=0, mycelium=0.3)
+    assert len(CapNet().process(frame)[1]) == 0
+
+
+def test_the_same_image_gives_the_same_bytes() -> None:
+    frame = first("dense")
+    (mask, circles), (again, others) = CapNet().process(frame), CapNet().process(frame)
+    assert np.array_equal(mask.foreground, again.foreground)
+    assert circles.center.tobytes() == others.center.tobytes()
+    assert circles.radius.tobytes() == others.radius.tobytes()
+
+
+def test_a_wrong_model_is_named(tmp_path: Path) -> None:
+    frame = RgbdFrame(HEADER, np.zeros((64, 64, 3), np.uint8))
+    with pytest.raises(UsageError, match=r"gone\.onnx: there is no such file"):
+        CapNet(model=tmp_path / "gone.onnx").open()
+    foreign = answering(tmp_path / "foreign.onnx", np.zeros((1, 5, 16, 16)))
+    with pytest.raises(UsageError, match=r"foreign\.onnx: it calls itself None.*stage `onnx`"):
+        CapNet(model=foreign).open()
+    odd = answering(tmp_path / "odd.onnx", np.zeros((1, 3, 16, 16)), kind=KIND)
+    with pytest.raises(UsageError, match=r"odd\.onnx: its output has shape \(1, 3, 16, 16\)"):
+        CapNet(model=odd).process(frame)
+
+
+def test_a_radius_range_the_wrong_way_round_is_refused() -> None:
+    with pytest.raises(ValidationError, match=r"radius_px must be \[smallest, largest\]"):
+        CapNet(radius_px=(38, 8))

@@ -1,0 +1,62 @@
+"""What `cap-net` is taught: targets say where the caps of a crop really are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mushpipe.core.truth import Ignore
+from mushpipe.stages.cap_decode import HEAT, MASK, circles_of
+from training.net.augment import aims, crop
+from training.net.scenes import Picture, settings
+
+DISCS = [(150.0, 120.0, 30.0), (300.5, 200.25, 18.0), (420.0, 330.0, 41.0)]
+
+
+def picture(kind: int = Ignore.COUNTS, visible: float = 1.0) -> Picture:
+    """A frame of 640 x 480 with three discs, which are caps of one kind."""
+    v, u = np.mgrid[:480, :640]
+    cap = np.any([np.hypot(u - x, v - y) < r for x, y, r in DISCS], axis=0)
+    color = np.where(cap[..., None], 200, 40).astype(np.uint8).repeat(3, axis=2)
+    kinds, seen = np.full(3, kind, np.uint8), np.full(3, visible)
+    return Picture(color, cap, np.array(DISCS), kinds, seen)
+
+
+def test_the_target_decodes_to_the_circles_it_was_made_of() -> None:
+    circles = np.array([[20.3, 41.8, 12.0], [100.0, 70.5, 30.0]])
+    target, weight = aims(circles, np.zeros(2, bool), 40)
+    target[HEAT] = np.log(
+        target[HEAT].clip(1e-6, 1 - 1e-6) / (1 - target[HEAT].clip(1e-6, 1 - 1e-6))
+    )
+    found, _ = circles_of(target, 0.9)
+    assert found[np.argsort(found[:, 0])] == pytest.approx(circles, abs=1e-3)
+    assert (weight == 1).all()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_circles_of_a_crop_lie_on_its_caps(seed: int) -> None:
+    _, target, _ = crop(picture(), 224, np.random.default_rng(seed))
+    row, column = np.nonzero(target[HEAT] >= 0.999)
+    disc = np.zeros(target[MASK].shape, bool)
+    v, u = np.mgrid[:56, :56]
+    for i, j in zip(row, column, strict=True):
+        radius, dx, dy = np.exp(target[2, i, j]), target[3, i, j], target[4, i, j]
+        disc |= np.hypot(u - j - dx, v - i - dy) < radius - 1
+    assert (target[MASK][disc] > 0.9).all()
+
+
+def test_a_stump_is_no_cap_and_a_hidden_cap_is_not_asked_for() -> None:
+    stumps = [crop(picture(Ignore.CUT_STUMP), 224, np.random.default_rng(k)) for k in range(4)]
+    assert not any((target[HEAT] > 0).any() for _, target, _ in stumps)
+    assert all((weight == 1).all() for _, _, weight in stumps)
+    hidden = [crop(picture(visible=0.1), 224, np.random.default_rng(k)) for k in range(4)]
+    assert not any((target[HEAT] > 0).any() for _, target, _ in hidden)
+    assert any((weight == 0).any() for _, _, weight in hidden)
+
+
+def test_drawn_settings_are_ones_the_simulator_takes_and_of_family_a() -> None:
+    from mushpipe.sources.synthetic import SyntheticSource
+
+    drawn = [SyntheticSource(**settings(seed)) for seed in range(60)]
+    assert {source.shape_family for source in drawn} == {"a"}
+    assert {source.scene for source in drawn} == {"bed", "lab"}

@@ -1,0 +1,99 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mushpipe import RgbdFrame
+from mushpipe.core.errors import UsageError
+from mushpipe.stages.onnx_model import Onnx
+from tests.stages.networks import answering, of_brightness
+from tests.stages.scenes import HEADER, discs, frame_of
+
+CIRCLES = [(40.0, 40.0, 15.0), (100.0, 70.0, 20.0)]
+BRIGHT = [[40 / 3] * 3], [-20.0]  # logit 20 at white, -20 at black
+
+
+def test_logits_of_one_channel_become_mask_and_pieces(tmp_path: Path) -> None:
+    image = discs(CIRCLES, 0.9, 0.1)
+    stage = Onnx(model=of_brightness(tmp_path / "m.onnx", *BRIGHT), output="logits")
+    mask, circles = stage.process(frame_of(image))
+    assert np.array_equal(mask.foreground, np.rint(image * 255) / 255 >= 0.5)
+    found = np.column_stack([circles.center, circles.radius])
+    assert found[np.argsort(found[:, 0])] == pytest.approx(np.array(CIRCLES), abs=0.2)
+    assert (circles.score > 0.9).all()
+
+
+def test_the_likelier_of_three_classes_is_taken(tmp_path: Path) -> None:
+    color = np.zeros((32, 64, 3), np.uint8)
+    color[:, :20, 0], color[:, 20:40, 1], color[:, 40:, 2] = 255, 255, 255
+    model = of_brightness(tmp_path / "m.onnx", 9 * np.eye(3), [0.0] * 3)
+    for wanted in range(3):
+        stage = Onnx(model=model, output="logits", class_id=wanted)
+        mask, _ = stage.process(RgbdFrame(HEADER, color))
+        assert np.array_equal(mask.foreground, color[..., wanted] > 0)
+        swapped = stage.model_copy(update={"order": "bgr", "class_id": 2 - wanted})
+        assert np.array_equal(
+            swapped.process(RgbdFrame(HEADER, color))[0].foreground, mask.foreground
+        )
+
+
+def test_a_fixed_input_is_letterboxed_and_taken_back(tmp_path: Path) -> None:
+    image = discs(CIRCLES, 0.9, 0.1)
+    path = of_brightness(tmp_path / "m.onnx", *BRIGHT, image=[1, 3, 320, 320])
+    mask, _ = Onnx(model=path, output="logits").process(frame_of(image))
+    assert (mask.foreground != (image > 0.5)).mean() < 0.01
+
+
+def test_the_three_layouts_of_yolo_say_the_same_circles(tmp_path: Path) -> None:
+    """A 160 x 100 image in a 320 x 320 input is twice as large, with 60 px of gray above."""
+    frame = frame_of(np.zeros((100, 160)), camera=None)
+    x, y, r = np.array(CIRCLES).T
+    box = np.column_stack([2 * (x + 0.5), 2 * (y + 0.5) + 60, 4 * r, 4 * r])
+    other, score = np.full(2, 0.1), np.array([0.8, 0.9])
+    corners = np.column_stack([box[:, :2] - box[:, 2:] / 2, box[:, :2] + box[:, 2:] / 2])
+    layouts = {
+        "yolov5": np.column_stack([box, np.ones(2), other, score]),
+        "yolov8": np.column_stack([box, other, score]).T,
+        "yolov10": np.column_stack([corners, score, np.ones(2)]),
+    }
+    for name, answer in layouts.items():
+        model = answering(tmp_path / f"{name}.onnx", answer[None], image=[1, 3, 320, 320])
+        stage = Onnx(model=model, output=name, class_id=1)
+        mask, circles = stage.process(frame)
+        found = np.column_stack([circles.center, circles.radius, circles.score])
+        wanted = np.column_stack([CIRCLES[::-1], score[::-1]])
+        assert found == pytest.approx(wanted, abs=1e-4), name
+        assert (mask.foreground != (discs(CIRCLES, 1, 0) > 0.5)[:100, :160]).mean() < 0.01
+        with_zero = stage.model_copy(update={"class_id": 0})
+        assert len(with_zero.process(frame)[1]) == 0
+
+
+def test_of_boxes_on_one_cap_the_likeliest_stays(tmp_path: Path) -> None:
+    box = np.array([[50, 50, 30, 30, 0.7], [52, 50, 30, 30, 0.9], [50, 50, 30, 30, 0.2]])
+    model = answering(tmp_path / "m.onnx", box.T[None], image=[1, 3, 96, 96])
+    _, circles = Onnx(model=model, output="yolov8").process(
+        frame_of(np.zeros((96, 96)), camera=None)
+    )
+    assert circles.score == pytest.approx([0.9])
+
+
+def test_what_cannot_work_is_said_with_the_file(tmp_path: Path) -> None:
+    frame = frame_of(np.zeros((96, 96)), camera=None)
+    with pytest.raises(UsageError, match=r"gone\.onnx: there is no such file"):
+        Onnx(model=tmp_path / "gone.onnx", output="logits").open()
+    text = tmp_path / "text.onnx"
+    text.write_text("not a model")
+    with pytest.raises(UsageError, match=r"text\.onnx: ONNX Runtime cannot load it"):
+        Onnx(model=text, output="logits").open()
+    gray = answering(tmp_path / "gray.onnx", np.zeros((1, 4, 4)), image=[1, 1, 8, 8])
+    with pytest.raises(UsageError, match=r"expected one image \(1, 3, H, W\)"):
+        Onnx(model=gray, output="logits").open()
+    boxes = answering(tmp_path / "boxes.onnx", np.zeros((1, 5, 7)))
+    with pytest.raises(UsageError, match="has no output 'mask'; it has: found"):
+        Onnx(model=boxes, output="logits", tensor="mask").open()
+    with pytest.raises(UsageError, match=r"shape \(1, 5, 7\).*expects \(1, N, 6\)"):
+        Onnx(model=boxes, output="yolov10").process(frame)
+    with pytest.raises(UsageError, match=r"class_id 3 expects \(1, 4 \+ C, N\)"):
+        Onnx(model=boxes, output="yolov8", class_id=3).process(frame)

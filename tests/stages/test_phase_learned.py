@@ -1,0 +1,44 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mushpipe import Circles, InputError, Mask
+from mushpipe.stages.phase_hough import PhaseHough
+from mushpipe.stages.phase_learned import agreement, candidates_of
+from tests.stages.scenes import discs, frame_of
+
+
+def circles(*rows: tuple[float, float, float, float]) -> Circles:
+    table = np.array(rows, float).reshape(-1, 4)
+    return Circles(table[:, :2], table[:, 2], table[:, 3])
+
+
+def test_agreement_is_score_times_shared_area() -> None:
+    shapes = np.array([[50, 50, 20, 0, 0], [50, 50, 10, 0, 0], [200, 50, 10, 0, 0]], float)
+    learned = circles((50, 50, 20, 0.8), (50, 50, 40, 1.0))
+    # the same circle; concentric ones share the smaller's area, r^2 / R^2
+    wanted = [0.8, 0.8 * 0.25, 0.0]
+    assert agreement(shapes, shapes[:, 2], learned) == pytest.approx(wanted)
+    assert agreement(shapes, shapes[:, 2], circles()).tolist() == [0, 0, 0]
+
+
+def test_candidates_are_the_circles_of_the_range() -> None:
+    learned = circles((50, 40, 7, 0.9), (60, 41, 20, 0.3), (70, 42, 50, 0.9))
+    assert candidates_of(learned, 8, 45) == pytest.approx(np.array([[60, 41, 20, 0.3]]))
+
+
+def test_without_circles_use_learned_says_what_is_missing() -> None:
+    image, stage = discs([(60, 60, 20)], 0.8, 0.1), PhaseHough(use_learned=True)
+    stage.open()
+    with pytest.raises(InputError, match="needs a stage above that finds circles"):
+        stage.process(frame_of(image), Mask(image > 0.5))
+
+
+def test_circles_above_change_nothing_unless_asked_for() -> None:
+    image = discs([(40, 60, 20), (110, 60, 15)], 0.8, 0.1)
+    frame, mask = frame_of(image), Mask(image > 0.5)
+    alone = PhaseHough().process(frame, mask)
+    beside = PhaseHough().process(frame, mask, circles((80, 20, 12, 1.0)))
+    assert np.array_equal(alone.center, beside.center)
+    assert np.array_equal(alone.score, beside.score)

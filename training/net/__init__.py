@@ -1,0 +1,1 @@
+"""Training of `cap-net`, the small learned detector, from simulated frames alone."""

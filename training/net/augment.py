@@ -1,0 +1,124 @@
+"""Crops of the frames under everything a camera and a bed may do, and what the net should say."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mushpipe.core.truth import Ignore
+from mushpipe.stages.cap_decode import CHANNELS, HEAT, MASK, OFFSET, RADIUS, STRIDE
+from training.net.scenes import Picture
+
+Singles = NDArray[np.float32]
+SMALLEST = 5.0  # px; smaller outlines are not asked for
+HIDDEN = 0.3  # nor are those of which less is seen
+
+
+def crop(picture: Picture, size: int, rng: np.random.Generator) -> tuple[Singles, Singles, Singles]:
+    """Return an image (3, size, size) in 0..1, its target (5, h, w) and weight (h, w)."""
+    matrix, scale = _placement(picture, size, rng)
+    color = cv2.warpAffine(
+        picture.color, matrix, (size, size), flags=cv2.INTER_LINEAR,
+        borderValue=rng.integers(0, 256, 3).tolist(),
+    )  # fmt: skip
+    cap = cv2.warpAffine(picture.cap.astype(np.float32), matrix, (size, size))
+    image = photographed(np.asarray(color, np.float32) / 255, np.asarray(cap, np.float32), rng)
+    center = picture.circles[:, :2] @ matrix[:, :2].T + matrix[:, 2]
+    circles = np.column_stack([center, picture.circles[:, 2] * scale])
+    stump = picture.kind == Ignore.CUT_STUMP
+    target, weight = aims(circles[~stump], (picture.visible < HIDDEN)[~stump], size // STRIDE)
+    target[MASK] = cv2.resize(cap, None, fx=1 / STRIDE, fy=1 / STRIDE, interpolation=cv2.INTER_AREA)
+    return np.ascontiguousarray(image.transpose(2, 0, 1)), target, weight
+
+
+def _placement(
+    picture: Picture, size: int, rng: np.random.Generator
+) -> tuple[NDArray[np.float64], float]:
+    """Draw an affine map (2, 3) of the frame onto the crop, and its scale."""
+    scale = float(np.exp(rng.uniform(np.log(0.55), np.log(1.8))))
+    turn = rng.uniform(-np.pi, np.pi)
+    c, s = scale * np.cos(turn), scale * np.sin(turn)
+    linear = np.array([[c, -s], [s, c]]) * rng.choice([-1, 1], (1, 1))
+    linear[0] *= rng.choice([-1.0, 1.0])
+    height, width = picture.cap.shape
+    reach = min(0.45 * size / scale, 0.4 * height)
+    middle = rng.uniform((reach, reach), (width - reach, height - reach))
+    return np.column_stack([linear, size / 2 - linear @ middle]), scale
+
+
+def aims(
+    circles: NDArray[np.float64], unsure: NDArray[np.bool_], cells: int
+) -> tuple[Singles, Singles]:
+    """Return target (5, h, w), its mask still empty, and weight (h, w) of circles (N, 3) px.
+
+    Heat is a Gaussian of a sixth of the diameter, cut at 1 in the cell of the centre.
+    """
+    target = np.zeros((CHANNELS, cells, cells), np.float32)
+    weight = np.ones((cells, cells), np.float32)
+    v, u = np.mgrid[:cells, :cells].astype(np.float32)
+    # pixel x lies in cell (x + 0.5) / STRIDE - 0.5
+    for (x, y, radius), doubt in zip(circles, unsure, strict=True):
+        cx, cy = (x + 0.5) / STRIDE - 0.5, (y + 0.5) / STRIDE - 0.5
+        r = radius / STRIDE
+        if not (-r < cx < cells + r and -r < cy < cells + r):
+            continue
+        dx, dy = cx - u, cy - v
+        square = dx * dx + dy * dy
+        column, row = round(cx), round(cy)
+        if doubt or radius < SMALLEST or not (0 <= column < cells and 0 <= row < cells):
+            weight[(square < (0.8 * r + 0.7) ** 2) & (target[HEAT] < 0.3)] = 0
+            continue
+        heat = np.exp(-square / (2 * max(r / 3, 0.7) ** 2))
+        heat[row, column] = 1
+        nearer = heat > target[HEAT]
+        target[HEAT][nearer] = heat[nearer]
+        target[RADIUS][nearer] = np.log(r)
+        target[OFFSET.start][nearer], target[OFFSET.start + 1][nearer] = dx[nearer], dy[nearer]
+        weight[heat > 0.3] = 1
+    return target, weight
+
+
+def photographed(image: Singles, cap: Singles, rng: np.random.Generator) -> Singles:
+    """Return an image (H, W, 3) with other colours, light, blur, noise and things before it."""
+    if rng.random() < 0.4:  # other caps on the same bed
+        gain = np.exp(rng.uniform(-0.8, 0.3) + rng.normal(0, 0.12, 3)).astype(np.float32)
+        image = image * (1 + cap[..., None] * (gain - 1))
+    image = image * np.exp(rng.normal(0, 0.08, 3)).astype(np.float32)
+    gray = image.mean(axis=2, keepdims=True)
+    image = gray + (image - gray) * np.float32(rng.uniform(0.2, 1.6))
+    image = np.clip(image, 0, 1) ** np.float32(np.exp(rng.normal(0, 0.25)))
+    image = image * _light(image.shape[0], rng)[..., None]
+    image = image * np.float32(np.exp(rng.normal(0, 0.3))) + np.float32(rng.normal(0, 0.03))
+    image = image * np.float32(max(1.0, rng.uniform(0.04, 0.2) / max(image.mean(), 1e-3)))
+    image = _patches(image, rng)
+    if rng.random() < 0.4:
+        image = cv2.GaussianBlur(image, (0, 0), rng.uniform(0.3, 1.5))
+    image = image + rng.standard_normal(image.shape, np.float32) * np.float32(
+        rng.exponential(0.015)
+    )
+    return np.asarray(np.clip(image, 0, 1), np.float32)
+
+
+def _light(size: int, rng: np.random.Generator) -> Singles:
+    """Return smooth light and, at times, the edge of a shadow."""
+    field = rng.normal(0, rng.uniform(0, 0.45), (4, 4)).astype(np.float32)
+    light = np.exp(cv2.resize(field, (size, size), interpolation=cv2.INTER_CUBIC))
+    if rng.random() < 0.2:
+        turn, offset = rng.uniform(0, 2 * np.pi), rng.uniform(-0.4, 0.4)
+        v, u = np.mgrid[-0.5 : 0.5 : size * 1j, -0.5 : 0.5 : size * 1j]
+        dark = np.clip((u * np.cos(turn) + v * np.sin(turn) - offset) * size / 6, 0, 1)
+        light = light * (1 - rng.uniform(0.2, 0.7) * dark).astype(np.float32)
+    return np.asarray(light, np.float32)
+
+
+def _patches(image: Singles, rng: np.random.Generator) -> Singles:
+    """Lay some flat or striped bars over the image."""
+    size = image.shape[0]
+    for _ in range(rng.poisson(0.5)):
+        corner = rng.uniform(0, size, 2)
+        box = (tuple(corner), tuple(rng.uniform(3, 40, 2)), float(rng.uniform(0, 180)))
+        points = np.rint(cv2.boxPoints(box)).astype(np.int32)
+        image = np.ascontiguousarray(image)
+        cv2.fillConvexPoly(image, points, rng.uniform(0, 1, 3).tolist(), cv2.LINE_AA)
+    return image

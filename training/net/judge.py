@@ -1,0 +1,83 @@
+"""Judge `cap-net` beside the classic detector, on what trained neither.
+
+`python -m training.net.judge` prints simulated scenes of both shape families by condition, and
+with `--field FOLDER` labelled real recordings.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections import defaultdict
+from collections.abc import Iterator
+from itertools import chain
+from pathlib import Path
+
+from mushpipe.sources.mcap import McapSource
+from mushpipe.stages.cap_net import CapNet
+from mushpipe.stages.phase_hough import PhaseHough
+from training import judge
+from training.field import RANGES, labelled, result
+from training.matching import Score, counted
+from training.net.scenes import varied_cases
+from training.scenes import judging_cases
+from training.verifier import NET, RADII, segmentations
+
+CLASSIC = {
+    "image": PhaseHough(radius_px=RADII, use_depth=False),
+    "depth": PhaseHough(radius_px=RADII),
+    "image+net": PhaseHough(radius_px=RADII, use_depth=False, use_learned=True),
+    "depth+net": PhaseHough(radius_px=RADII, use_learned=True),
+}
+
+
+def simulated(models: list[Path], cache: Path, peers: bool) -> str:
+    """Return the table of all models; with `peers`, of the classic detector too."""
+    nets = {path.stem: CapNet(radius_px=RADII, model=path) for path in models}
+    scores: dict[tuple[str, str], Score] = defaultdict(Score)
+    for case in chain(judging_cases(cache), varied_cases(cache, "b", 16)):
+        counts = counted(case.truth, *RADII)
+        for name, net in nets.items():
+            scores[case.condition, name].add(net.process(case.frame)[1], case.truth, counts)
+        if peers:
+            frame, mask = segmentations(case.frame)[0]
+            learned = NET.process(case.frame)[1]
+            for name, stage in CLASSIC.items():
+                circles = stage.process(frame, mask, learned)
+                scores[case.condition, name].add(circles, case.truth, counts)
+    return judge.table(scores, [*nets, *(CLASSIC if peers else ())])
+
+
+def real(model: Path, folder: Path) -> Iterator[str]:
+    """Yield a line per labelled frame of the recordings in a folder."""
+    for path in sorted(folder.glob("*.mcap")):
+        labels = json.loads(path.with_suffix(".labels.json").read_text())
+        radius = next(v for k, v in RANGES.items() if path.stem.startswith(k))["radius_px"]
+        net = CapNet(radius_px=radius or (15, 90), model=model)
+        source = McapSource(path=path)
+        source.open()
+        for frame in source.frames():
+            wanted = labelled(labels, frame.header.stamp_ns)
+            if wanted is not None:
+                text = result(net.process(frame)[1], *wanted)
+                yield f"{path.stem:18} #{frame.header.sequence} {text}"
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    shipped = Path("mushpipe/stages/cap_net.onnx")
+    parser.add_argument("--cache", type=Path, default=Path("out/scenes"), help="rendered frames")
+    parser.add_argument("--models", type=Path, nargs="+", default=[shipped])
+    parser.add_argument("--peers", action="store_true", help="the classic detector as well")
+    parser.add_argument("--field", type=Path, help="labelled real recordings instead")
+    arguments = parser.parse_args()
+    if arguments.field:
+        for line in real(arguments.models[0], arguments.field):
+            print(line)
+    else:
+        print(simulated(arguments.models, arguments.cache, arguments.peers))
+
+
+if __name__ == "__main__":
+    main()

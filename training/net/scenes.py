@@ -1,0 +1,159 @@
+"""Simulated frames that vary in everything the simulator can vary, of shape family a, deformed.
+
+`python -m training.net.scenes` renders them ahead of the training; family b is left for judging.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mushpipe.core.truth import INSTANCES_TOPIC, TRUTH_TOPIC, Ignore, Instances, Truth
+from mushpipe.sources.synthetic import SyntheticSource
+from training.scenes import Case, stored
+
+Floats = NDArray[np.float64]
+TRAINING_SEED, VALIDATION_SEED, JUDGING_SEED, VERIFIER_SEED = 200_000, 300_000, 400_000, 500_000
+TRAINING, VALIDATION = 640, 60
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A frame to learn from.
+
+    Attributes:
+        color: (H, W, 3) uint8 RGB.
+        cap: (H, W) bool, pixels of caps.
+        circles: (N, 3) px: centre and radius of each outline.
+        kind: (N,) `Ignore`.
+        visible: (N,) 0..1.
+    """
+
+    color: NDArray[np.uint8]
+    cap: NDArray[np.bool_]
+    circles: Floats
+    kind: NDArray[np.uint8]
+    visible: Floats
+
+
+def settings(seed: int) -> dict[str, Any]:
+    """Draw the settings of a scene."""
+    rng = np.random.default_rng([seed, 8])
+
+    def log(low: float, high: float) -> float:
+        return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+    def some(share: float, most: float) -> float:
+        return float(rng.uniform(0, most)) if rng.random() < share else 0.0
+
+    distance, small, tilt = log(0.28, 0.85), rng.uniform(10, 30), rng.uniform(0, 15)
+    count = 0 if rng.random() < 0.05 else log(6, 120) * (distance / 0.5) ** 2
+    lab = rng.random() < 0.2
+    return {
+        "seed": seed,
+        "max_frames": 1,
+        "scene": "lab" if lab else "bed",
+        "printed": rng.random() < 0.3,
+        "table": str(rng.choice(["wood", "cloth", "paint"])),
+        "clutter": int(rng.integers(0, 13)),
+        "distance": distance,
+        "camera_tilt_deg": some(0.5, 20),
+        "count": round(min(count * (0.2 if lab else 1), 200)),
+        "cluster": float(rng.random()),
+        "size_mm": (small, small + rng.uniform(5, 45)),
+        "tilt_deg": (tilt, tilt + rng.uniform(5, 30)),
+        "cap_color": str(rng.choice(["white", "brown", "cream", "mixed"], p=[0.3, 0.4, 0.1, 0.2])),
+        "pins": round(some(0.3 if lab else 0.8, 120)),
+        "stumps": round(some(0.6, 14)),
+        "fallen": round(some(0.5, 6)),
+        "lean": some(0.7, 1),
+        "deform": rng.uniform(0.2, 1),
+        "mycelium": some(0.8, 1),
+        "soil": log(0.3, 6),
+        "wet": some(0.4, 1),
+        "relief_mm": some(0.7, 6),
+        "rubble": round(some(0.75, 130)),
+        "foreign": round(some(0.35, 6)),
+        "tray": rng.random() < 0.2,
+        "light": str(rng.choice(["even", "gradient", "side", "spot", "harsh"])),
+        "light_strength": rng.uniform(0.2, 1),
+        "color": {
+            "exposure": rng.uniform(-1.2, 0.7),
+            "blur": rng.uniform(0.2, 1.4),
+            "vignette": rng.uniform(0, 0.7),
+            "white_balance": some(0.7, 0.15),
+            "noise": log(0.4, 4),
+            "jpeg_quality": int(rng.choice([0, 60, 80, 92])),
+        },
+    }
+
+
+def picture(seed: int, cache: Path) -> Picture:
+    """Return a frame, from the cache folder where it was rendered before."""
+    path = cache / f"{seed}.npz"
+    if not path.exists():
+        _render(seed, path)
+    with np.load(path) as file:
+        color = cv2.imdecode(file["color"], cv2.IMREAD_COLOR_RGB)
+        cap = cv2.imdecode(file["cap"], cv2.IMREAD_GRAYSCALE) > 0
+        return Picture(
+            np.asarray(color, np.uint8), cap, file["circles"], file["kind"], file["visible"]
+        )
+
+
+def _render(seed: int, path: Path) -> None:
+    frame = next(iter(SyntheticSource(**settings(seed)).frames()))
+    truth, instances = frame.attached[TRUTH_TOPIC], frame.attached[INSTANCES_TOPIC]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_suffix(".part.npz")
+    np.savez(
+        part,
+        color=cv2.imencode(".png", frame.color[..., ::-1])[1],
+        cap=cv2.imencode(".png", _caps(truth, instances).astype(np.uint8))[1],
+        circles=np.column_stack([truth.center, truth.radius]),
+        kind=truth.ignore,
+        visible=truth.visible,
+    )
+    part.rename(path)
+
+
+def _caps(truth: Truth, instances: Instances) -> NDArray[np.bool_]:
+    return np.append(False, truth.ignore != Ignore.CUT_STUMP)[instances.labels]
+
+
+def pictures(first: int, count: int, cache: Path) -> Iterator[Picture]:
+    """Yield the frames of `count` seeds from `first` on."""
+    for seed in range(first, first + count):
+        yield picture(seed, cache)
+
+
+def varied_cases(cache: Path, family: Literal["a", "b"], count: int) -> Iterator[Case]:
+    """Yield as varied frames with depth: family a for training a verifier, b for judging only."""
+    first = VERIFIER_SEED if family == "a" else JUDGING_SEED
+    for seed in range(first, first + count):
+        drawn = settings(seed) | {"shape_family": family}
+        yield stored(cache / f"varied-{family}-{seed}.pickle", "varied", drawn)
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cache", type=Path, default=Path("out/net"), help="rendered frames")
+    parser.add_argument("--part", type=int, default=0, help="this process' number")
+    parser.add_argument("--of", type=int, default=1, help="how many processes share the work")
+    arguments = parser.parse_args()
+    seeds = [*range(VALIDATION_SEED, VALIDATION_SEED + VALIDATION)]
+    seeds += range(TRAINING_SEED, TRAINING_SEED + TRAINING)
+    for seed in seeds[arguments.part :: arguments.of]:
+        picture(seed, arguments.cache)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,98 @@
+"""Train `cap-net` and export it: `python -m training.net.train`.
+
+Frames come from `training.net.scenes` (family a, deformed, seeds from 200 000 on); nothing real.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import nn
+
+from training.net.augment import crop
+from training.net.model import CapNet, loss_of
+from training.net.scenes import TRAINING, TRAINING_SEED, Picture, picture
+
+SIZE, BATCH, RATE, DECAY = 224, 8, 2.5e-3, 0.998
+
+
+class Crops:
+    """Batches from the frames, with a generator of their own."""
+
+    def __init__(self, frames: list[Picture], seed: int) -> None:
+        self._frames, self._rng = frames, np.random.default_rng([seed, 9])
+
+    def batch(self) -> tuple[torch.Tensor, ...]:
+        """Return images, targets and weights."""
+        picks = self._rng.integers(len(self._frames), size=BATCH)
+        rows = [crop(self._frames[k], SIZE, self._rng) for k in picks]
+        return tuple(torch.from_numpy(np.stack(part)) for part in zip(*rows, strict=True))
+
+
+def averaged(slow: nn.Module, fast: nn.Module, step: int) -> None:
+    """Move the running mean of the weights towards the current ones, faster at the start."""
+    keep = min(DECAY, (1 + step) / (10 + step))
+    with torch.no_grad():
+        for a, b in zip(slow.state_dict().values(), fast.state_dict().values(), strict=True):
+            if a.is_floating_point():
+                a.lerp_(b, 1 - keep)
+            else:
+                a.copy_(b)
+
+
+def train(frames: list[Picture], steps: int, seed: int, out: Path) -> None:
+    """Train a network and write the running mean of its weights, every hundred steps.
+
+    AdamW with a linear warm-up over 100 steps and a cosine to zero.
+    """
+    torch.manual_seed(seed)
+    net = CapNet().to(memory_format=torch.channels_last)
+    slow = copy.deepcopy(net)
+    crops = Crops(frames, seed)
+    optimizer = torch.optim.AdamW(net.parameters(), RATE, weight_decay=1e-3)
+    schedule = torch.optim.lr_scheduler.LambdaLR(
+        optimizer,
+        lambda k: min(1.0, (k + 1) / 100) * 0.5 * (1 + np.cos(np.pi * k / steps)),
+    )
+    began, total = time.monotonic(), 0.0
+    for step in range(steps):
+        image, target, weight = crops.batch()
+        output = net(image.to(memory_format=torch.channels_last))
+        loss = loss_of(output, target, weight)
+        optimizer.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(net.parameters(), 5.0)
+        optimizer.step()
+        schedule.step()
+        averaged(slow, net, step)
+        total += loss.item()
+        if step % 100 == 99:
+            print(
+                f"step {step + 1}: loss {total / 100:.3f}, {time.monotonic() - began:.0f} s",
+                flush=True,
+            )
+            total = 0.0
+            torch.save(slow.state_dict(), out)
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cache", type=Path, default=Path("out/net"), help="rendered frames")
+    parser.add_argument("--frames", type=int, default=TRAINING)
+    parser.add_argument("--steps", type=int, default=3500)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=Path("out/net/cap-net.pt"))
+    arguments = parser.parse_args()
+    seeds = range(TRAINING_SEED, TRAINING_SEED + arguments.frames)
+    frames = [picture(seed, arguments.cache) for seed in seeds]
+    train(frames, arguments.steps, arguments.seed, arguments.out)
+
+
+if __name__ == "__main__":
+    main()
