@@ -16,7 +16,14 @@ from mcap_protobuf.decoder import DecoderFactory
 from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.recording import MANIFEST, Raw, RecordingReader
 from mushpipe.core.types import Mask, RgbdFrame, Trace
-from mushpipe.core.wire import COLOR_TOPIC, RESULT_PREFIX, TABLES, TIMING_TOPIC, decode_table
+from mushpipe.core.wire import (
+    COLOR_TOPIC,
+    NO_DEPTH,
+    RESULT_PREFIX,
+    TABLES,
+    TIMING_TOPIC,
+    decode_table,
+)
 
 
 def read_manifest(path: Path) -> dict[str, Any]:
@@ -123,8 +130,13 @@ def _trace(frame: RgbdFrame, messages: list[Raw], order: list[str]) -> Trace:
             outputs[stage] = (*outputs.get(stage, ()), decoded.table if decoded else None)
         elif schema == "foxglove.RawImage" and (image := _image(raw)) is not None:
             images.setdefault(stage, {})[part] = image
+            if NO_DEPTH.items() <= raw.channel.metadata.items():
+                images[stage]["depth"] = (None, frame.depth_scale)
+    last = frame
     for stage, parts in images.items():
-        outputs[stage] = (_of_images(frame, parts), *outputs.get(stage, ()))
+        value = _of_images(last, parts)
+        last = value if isinstance(value, RgbdFrame) else last
+        outputs[stage] = (value, *outputs.get(stage, ()))
     return Trace(frame, {stage: values for stage, values in outputs.items() if values}, durations)
 
 
@@ -141,10 +153,11 @@ def _image(raw: Raw) -> Any:
     return None if scale is None else decode_depth(message, float(scale))
 
 
-def _of_images(frame: RgbdFrame, parts: Mapping[str, Any]) -> Mask | RgbdFrame:
-    """Return the mask, or the changed frame, that a stage's images are."""
-    if "color" in parts:
-        depth, scale = parts.get("depth", (None, frame.depth_scale))
-        return replace(frame, color=parts["color"], depth=depth, depth_scale=scale)
+def _of_images(last: RgbdFrame, parts: Mapping[str, Any]) -> Mask | RgbdFrame:
+    """Return the mask a stage's images are, or the frame they make of the last one before it."""
+    if "color" in parts or "depth" in parts:
+        depth, scale = parts.get("depth", (last.depth, last.depth_scale))
+        color = parts.get("color", last.color)
+        return replace(last, color=color, depth=depth, depth_scale=scale)
     masks = {name: pixels[..., 0] > 0 for name, pixels in parts.items()}
     return Mask(masks[""], masks.get("initial"))

@@ -25,6 +25,7 @@ DEPTH_TOPIC = "/camera/aligned_depth_to_color/image_raw"
 CAMERA_TOPIC = "/camera/color/camera_info"
 RESULT_PREFIX = "/mushpipe/"
 TIMING_TOPIC = "/mushpipe/timing"
+NO_DEPTH = {"depth": "none"}  # metadata of the colour of a stage's frame without depth
 DRAWINGS = ("foxglove.ImageAnnotations", "foxglove.SceneUpdate")  # made of the tables beside them
 # name here -> name in ROS and Foxglove
 DISTORTION_MODELS = {

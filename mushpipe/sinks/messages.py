@@ -25,7 +25,7 @@ def result_messages(
         drawn: Whether circles and picks come with their drawings for viewers as well.
         images: Whether colour and depth that a stage made are among them.
     """
-    passed_on = {id(trace.frame.color), id(trace.frame.depth)}
+    last = trace.frame
     for stage in trace.durations_ns:
         values = trace.outputs[stage]
         for value in values:
@@ -38,7 +38,8 @@ def result_messages(
             topic = f"{wire.RESULT_PREFIX}{stage}{own}"
             messages = encoder(value, trace.frame.header)
             if isinstance(value, RgbdFrame):
-                messages = _made(value, messages, passed_on) if images else iter(())
+                messages = _made(value, messages, last) if images else iter(())
+                last = value
             for message in messages:
                 yield topic + message.suffix, message
             for message in drawings(value, trace.frame.header) if drawn else ():
@@ -46,14 +47,20 @@ def result_messages(
 
 
 def _made(
-    frame: RgbdFrame, messages: Iterator[wire.Message], passed_on: set[int]
+    frame: RgbdFrame, messages: Iterator[wire.Message], last: RgbdFrame
 ) -> Iterator[wire.Message]:
-    """Yield the images of a frame that are new: what a stage passed on was written before."""
-    images = {"/color": frame.color, "/depth": frame.depth}
+    """Yield the images of a frame that the one before it in the graph does not have.
+
+    Who reads them carries the others on; colour says where there is no depth to carry on.
+    """
     for message in messages:
-        if id(images[message.suffix]) not in passed_on:
+        if message.suffix == "/depth":
+            if frame.depth is not last.depth:
+                yield message
+        elif frame.depth is None:
+            yield message._replace(metadata=wire.NO_DEPTH)
+        elif frame.color is not last.color:
             yield message
-    passed_on |= {id(image) for image in images.values()}
 
 
 def timing_message(trace: Trace) -> Published:
