@@ -25,10 +25,25 @@ def least_squares(columns: Floats, target: Floats, weight: Floats | None = None)
     Returns:
         (K,) the solution; of least norm where the columns do not determine it.
     """
-    weighted = columns if weight is None else columns * weight[:, None]
-    normal = np.einsum("mi,mj->ij", weighted, columns)
-    right = np.einsum("mi,m->i", weighted, target)
+    share = np.ones(len(target)) if weight is None else weight
+    # copies: of one type whatever is given, so that the kernel is compiled once
+    normal, right = _normal_equations(
+        *(np.array(part, np.float64, order="C") for part in (columns, target, share))
+    )
     return np.asarray(np.linalg.lstsq(normal, right)[0])
+
+
+@jit
+def _normal_equations(columns: Floats, target: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    size = columns.shape[1]
+    normal, right = np.zeros((size, size)), np.zeros(size)
+    for m in range(len(target)):
+        for i in range(size):
+            term = weight[m] * columns[m, i]
+            right[i] += term * target[m]
+            for j in range(size):
+                normal[i, j] += term * columns[m, j]
+    return normal, right
 
 
 @jit

@@ -13,6 +13,6 @@ def example_frame(cap: int = 200) -> RgbdFrame:
     A frame, since its arrays are read-only, which to the compiler is a type of its own.
     """
     v, u = np.mgrid[:128, :160]
-    disc = (u - 80) ** 2 + (v - 64) ** 2 < 30**2
+    disc = (u - 80) ** 2 + (v - 64) ** 2 < 36**2
     color = np.repeat(np.where(disc, cap, 60).astype(np.uint8)[..., None], 3, axis=2)
     return RgbdFrame(Header(0, 0, "warm-up"), color, np.where(disc, 470, 500).astype(np.uint16))
