@@ -54,7 +54,9 @@ def judged(graph: Path, recordings: list[Path], frames: int) -> dict[str, float]
     """Return the figures of a graph, those in ``COLUMNS`` and ``ms``."""
     command = [*CLI, "eval", str(graph), *map(str, recordings)]
     options = ["--frames", str(frames), "--resamples", "0", "--format", "json"]
-    run = subprocess.run([*command, *options], check=True, capture_output=True, text=True)
+    run = subprocess.run([*command, *options], check=False, capture_output=True, text=True)
+    if run.returncode:
+        raise SystemExit(run.stderr)
     whole = json.loads(run.stdout)["alternatives"][0]
     values = whole["overall"]["metrics"]
     figures = {name: values[name]["value"] for name in COLUMNS}

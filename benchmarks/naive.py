@@ -13,7 +13,15 @@ import numpy as np
 from skimage.filters import threshold_otsu
 from skimage.segmentation import chan_vese
 
-from mushpipe import Camera, DepthSource, PickFlag, Picks, RgbdFrame, Stage
+from mushpipe import (
+    Camera,
+    DepthSource,
+    PickFlag,
+    Picks,
+    RgbdFrame,
+    Stage,
+    quaternion_from_axis,
+)
 from mushpipe.core.libraries import import_open3d
 
 RADIUS_PX = (8, 45)
@@ -104,6 +112,7 @@ class Naive(Stage):
         if frame.depth is None or frame.camera is None:
             raise ValueError("the script needs depth and calibration")
         o3d = import_open3d()
+        o3d.utility.random.seed(0)
         found = circles(segmented(frame.gray))
         cloud, focal = point_cloud(frame.depth_m, frame.camera), frame.camera.fx
         position = np.array([nearest(cloud, c, *c[:2]) for c in found]).reshape(-1, 3)
@@ -117,10 +126,11 @@ class Naive(Stage):
         flags = PickFlag.DEPTH_MISSING * missing + PickFlag.POSE_UNKNOWN * np.isnan(axes[:, 0])
         unknown = np.full(n, np.nan)
         return Picks(
-            id=np.arange(n), center=found[:, :2], radius=found[:, 2], position=position,
+            id=np.arange(n), center=found[:, :2], radius=found[:, 2],
+            position=position, surface=position,
             distance=np.linalg.norm(position, axis=1),
             diameter=np.array([diameter(cloud, c) for c in found]),
-            quaternion=np.full((n, 4), np.nan), axis=axes, score=np.ones(n),
+            quaternion=quaternion_from_axis(axes), axis=axes, score=np.ones(n),
             sigma_position=np.full((n, 3), np.nan), sigma_diameter=unknown, sigma_tilt=unknown,
             source=np.where(missing, DepthSource.MISSING, DepthSource.MEASURED), flags=flags,
             frame_id=frame.header.frame_id,

@@ -26,9 +26,10 @@ def in_order(picks: Picks) -> NDArray[np.intp]:
 
 
 def posed(picks: Picks, rows: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return those of the rows that can be drawn as a cap: the axis and the diameter are known."""
+    """Return those of the rows that can be drawn as a cap: pose and diameter are known."""
     flagged = (picks.flags[rows] & PickFlag.POSE_UNKNOWN) != 0
-    known = np.isfinite(picks.axis[rows, 0]) & np.isfinite(picks.diameter[rows])
+    pose = np.column_stack([picks.axis[rows], picks.quaternion[rows], picks.diameter[rows]])
+    known = np.isfinite(pose).all(axis=1)
     return np.asarray(rows[known & ~flagged])
 
 

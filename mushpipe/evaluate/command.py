@@ -190,6 +190,8 @@ def _judge_graph(
     for option, number, plan in plans(graph, recordings, request.overrides, options, folder):
         report = runner(plan)
         require_results(report)
+        if report.error is not None:
+            logger.warning("%s: %s", option.label or graph, report.error)
         worst = worst or report.exit_code
         judged = _judge_run(request, plan, truths[number], recordings[number : number + 1])
         evaluations[option.label].recordings.append(judged)

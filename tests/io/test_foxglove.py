@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +86,13 @@ def test_circles_are_drawn_where_foxglove_counts_pixels_from(tmp_path: Path) -> 
     (plain,) = topics["/mushpipe/detect/annotations"]
     assert len(plain.circles) == 2
     assert not plain.texts
+
+
+def test_an_axis_without_its_quaternion_is_no_pose_to_draw(tmp_path: Path) -> None:
+    picks = replace(leaning(), quaternion=np.full((3, 4), NAN))
+    topics = decoded(record(tmp_path / "out.mcap", [trace_of(make_frame(), pick=picks)]))
+    (entity,) = topics["/mushpipe/pick/scene"][0].entities
+    assert (len(entity.spheres), len(entity.arrows), len(entity.texts)) == (0, 0, 3)
 
 
 def test_caps_axes_and_order_stand_in_the_scene(tmp_path: Path) -> None:
