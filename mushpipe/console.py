@@ -8,7 +8,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -100,22 +100,30 @@ def execute(
     return report
 
 
-def durations_table(report: RunReport) -> Table:
-    """Return what each node took for a frame; the total is that of the stages."""
-    columns = ("p50 ms", "p95 ms", "p99 ms", "max ms")
+def durations_table(
+    times: Mapping[str, Mapping[str, float]], ratios: Mapping[str, float] | None = None
+) -> Table:
+    """Return a table of what each node takes for a frame, as `Durations.summary` gives it.
+
+    Args:
+        times: By node.
+        ratios: By node, how many times those of a baseline they are, where there is one.
+    """
+    columns = ("p50 ms", "p95 ms", "p99 ms", "max ms", *(["x baseline"] if ratios else []))
     table = Table("", *columns, box=None, pad_edge=False)
     for column in table.columns[1:]:
         column.justify = "right"
-    for name, durations in {**report.durations, "all stages": report.frame}.items():
-        if durations.count:
-            table.add_row(name, *(f"{value:.2f}" for value in durations.summary().values()))
+    for name, values in times.items():
+        ratio = [f"{ratios[name]:.2f}" if name in ratios else ""] if ratios else []
+        table.add_row(name, *(f"{value:.2f}" for value in values.values()), *ratio)
     return table
 
 
 def show_report(report: RunReport) -> None:
     """Print the time per stage, the balance, and what was lost."""
     if report.frame.count:
-        stderr.print(durations_table(report))
+        summary = report.summary()
+        stderr.print(durations_table({**summary["durations"], "all stages": summary["frame"]}))
     rate = report.processed / report.elapsed_s if report.elapsed_s else 0.0
     stderr.print(
         f"{report.frames_in} frames in = {report.processed} processed + {report.dropped} dropped "

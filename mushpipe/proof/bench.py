@@ -42,6 +42,7 @@ def bench(plan_of: Callable[[int], Plan], frames: int) -> dict[str, Any]:
     cpu = time.process_time()
     report = _run(plan_of(frames), memory)
     cpu = time.process_time() - cpu
+    summary = report.summary()
     return {
         "graph": report.manifest["graph_file"],
         "recordings": report.manifest["recordings"],
@@ -53,8 +54,8 @@ def bench(plan_of: Callable[[int], Plan], frames: int) -> dict[str, Any]:
         "allocated_mb_per_frame": allocated,
         "peak_memory_mb": round(_peak_mb(), 1),
         "memory_growth_mb": round(memory.growth_mb(), 2),
-        "nodes": {name: d.summary() for name, d in report.durations.items() if d.count},
-        "frame": report.frame.summary(),
+        "nodes": summary["durations"],
+        "frame": summary["frame"],
     }
 
 

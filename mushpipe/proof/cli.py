@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from mushpipe.core.plan import Plan
     from mushpipe.proof.compare import Comparison, Difference
 
-_TIMES = ("p50 ms", "p95 ms", "p99 ms", "max ms")
 _FIGURES = (
     *("frames", "frames_per_s", "cpu_ms_per_frame", "cores_busy"),
     *("allocated_mb_per_frame", "peak_memory_mb", "memory_growth_mb"),
@@ -121,16 +120,11 @@ def _plan(graph: Path, recording: str | None, frames: int, overrides: list[str])
 
 def _show(result: dict[str, Any], ratios: dict[str, float]) -> None:
     from rich.console import Console
-    from rich.table import Table
 
-    table = Table("", *_TIMES, *(["x baseline"] if ratios else []), box=None, pad_edge=False)
-    for column in table.columns[1:]:
-        column.justify = "right"
-    for name, times in {**result["nodes"], "all stages": result["frame"]}.items():
-        ratio = [f"{ratios[name]:.2f}" if name in ratios else ""] if ratios else []
-        table.add_row(name, *(f"{value:.2f}" for value in times.values()), *ratio)
+    from mushpipe.console import durations_table
+
     console = Console(file=sys.stdout, highlight=False, soft_wrap=True)
-    console.print(table)
+    console.print(durations_table({**result["nodes"], "all stages": result["frame"]}, ratios))
     machine = result["machine"]
     console.print(f"{machine['cores']} cores of {machine['processor']}, Python {machine['python']}")
     for name in _FIGURES:

@@ -68,7 +68,7 @@ class CapFit(Stage):
             InputError: The frame has depth but no calibration.
         """
         if frame.depth is None or not len(circles):
-            return _unknown(len(circles))
+            return Locations.unknown(len(circles)), Poses.unknown(len(circles))
         if frame.camera is None:
             raise InputError(
                 "depth cannot be turned into metres without the camera's calibration: record "
@@ -144,11 +144,3 @@ def _poses(fits: Fits) -> Poses:
         fitness=fits.fitness,
         valid=fits.valid,
     )
-
-
-def _unknown(n: int) -> tuple[Locations, Poses]:
-    nan = np.full((n, 4), np.nan)
-    three, one = nan[:, :3], nan[:, 0]
-    missing = np.full(n, DepthSource.MISSING, np.uint8)
-    locations = Locations(three, one, one, missing, three, one)
-    return locations, Poses(nan, three, three, one, one, np.zeros(n, bool))

@@ -144,6 +144,17 @@ def _near(plane: Plane, x: float, y: float) -> float:
 
 
 @jit
+def _beyond_over_before(image: Plane, x: int, y: int, nx: float, ny: float) -> float:
+    """Return how bright it is beyond an edge, which the normal points away from, over before it."""
+    inside = _near(image, x + 3 * nx, y + 3 * ny)
+    outside = min(
+        _near(image, x - 2.5 * nx, y - 2.5 * ny),
+        _near(image, x - 3.5 * nx, y - 3.5 * ny),
+    )
+    return max(outside, 0.0) / max(inside, 1e-3)
+
+
+@jit
 def thin(
     image: Plane,
     gx: Plane,
@@ -196,12 +207,7 @@ def thin(
             points[count, 0], points[count, 1] = x + t * nx, y + t * ny
             points[count, 2], points[count, 3] = nx, ny
             points[count, 4] = m / threshold
-            inside = _near(image, x + 3 * nx, y + 3 * ny)
-            outside = min(
-                _near(image, x - 2.5 * nx, y - 2.5 * ny),
-                _near(image, x - 3.5 * nx, y - 3.5 * ny),
-            )
-            points[count, 5] = max(outside, 0.0) / max(inside, 1e-3)
+            points[count, 5] = _beyond_over_before(image, x, y, nx, ny)
             index[y, x] = count
             count += 1
     return count
