@@ -35,8 +35,10 @@ from mushpipe.stages.cap_samples import (
     touch,
 )
 from mushpipe.stages.cap_solve import ROUND, Noise, invert, refine, tilt, workspace
-from mushpipe.stages.cap_start import spread_of, start
+from mushpipe.stages.cap_start import CONICAL, USUAL, axis_of, spread_of, start
 
+POOR = 0.9  # a misfit (a usual cap has 0.25) at which a fit starts again from elsewhere,
+BETTER = 0.8  # and how much smaller another one must be
 ROUNDNESS = 0.015  # in rim radii: how far the rim of a cap is from the circle of its area
 
 
@@ -103,6 +105,41 @@ def gather(
 
 
 @jit
+def attempt(
+    frame: Any, circle: Floats, rank: int, size: float, seen: tuple[Singles, int],
+    upright: tuple[Floats, float], settings: Any, fit: tuple[Floats, Floats], work: Any,
+) -> tuple[int, float]:  # fmt: skip
+    """Fit a cap from where it starts: to its depth, then to its outline in colour as well.
+
+    Args:
+        frame: As in `first_fits`.
+        circle: (3,) x, y, radius, px.
+        rank: Of the circle.
+        size: Its radius at the cap, m.
+        seen: The cap's rays (6, ROOM), with room for those of the outline, and how many there are.
+        upright: Unit vector (3,) and spread of tilts, rad.
+        settings: As in `first_fits`.
+        fit: Parameters (15,), in and out, and covariance (8, 8), out.
+        work: From `workspace`.
+
+    Returns:
+        Number of rays along the outline in colour, and the misfit, infinite without a solution.
+    """
+    gray, image, focal = frame
+    (rays, count), (cap, covariance), setting = seen, fit, (settings[0], 1.0 / focal, size)
+    if refine(cap, rays, count, upright, setting, (0, 2), work)[0] < 0.0:
+        return 0, np.inf
+    lines = sample_outline(
+        gray, image[1], image[2], rank, cap, circle, focal, settings[2], work[1], rays[:, count:]
+    )
+    total, misfit = refine(cap, rays, count + lines, upright, setting, (2, 4), work)
+    if total < 0.0:
+        return 0, np.inf
+    invert(work[0][0], covariance)
+    return lines, misfit
+
+
+@jit
 def first_fits(
     frame: Any, circles: Floats, upright: tuple[Floats, float], settings: Any, rays: Singles,
     out: Any,
@@ -119,29 +156,35 @@ def first_fits(
         out: Per cap parameters, covariance, surface point with sigmas, and counts of points, edge
             rays, outline rays, weight; size, m; and misfit. A cap without a fit keeps a count of 0.
     """
-    gray, image, focal = frame
-    noise, sensor, outline_px, least = settings
+    _, image, focal = frame
     caps, covariances, _, counts = out
     rank, work = rank_by_depth(image[0], circles, image[2]), workspace()
+    other = (np.empty(SIZE), np.empty((UNKNOWNS, UNKNOWNS)))
+    spare = np.empty((6, ROOM), np.float32)
     for i in range(len(circles)):
-        circle, seen = circles[i], rays[i]
-        n, m, middle = gather(image, circle, rank[i], focal, sensor, seen)
-        if n < least or middle <= 0.0:
+        circle, fit = circles[i], (caps[i], covariances[i])
+        n, m, middle = gather(image, circle, rank[i], focal, settings[1], rays[i])
+        if n < settings[3] or middle <= 0.0:
             continue
-        size = circle[2] * middle / focal
+        size, count = circle[2] * middle / focal, ROUND + n + m
         ray = ray_at(image[1], focal, circle[0], circle[1])
-        start(caps[i], seen[:, ROUND:], n, upright[0], ray, middle, size)
-        setting, count = (noise, 1.0 / focal, size), ROUND + n + m
-        if refine(caps[i], seen, count, upright, setting, (0, 2), work)[0] < 0.0:
-            continue
-        lines = sample_outline(
-            gray, image[1], image[2], rank[i], caps[i], circle, focal, outline_px, work[1],
-            seen[:, count:],
-        )  # fmt: skip
-        if refine(caps[i], seen, count + lines, upright, setting, (2, 4), work)[0] < 0.0:
-            continue
-        invert(work[0][0], covariances[i])
-        counts[i, 0], counts[i, 1], counts[i, 2], counts[i, 4] = n, m, lines, size
+        axis = axis_of(rays[i][:, ROUND:], n, upright[0], ray)
+        start(caps[i], axis, USUAL, ray, middle, size)
+        lines, misfit = attempt(
+            frame, circle, rank[i], size, (rays[i], count), upright, settings, fit, work
+        )
+        if misfit > POOR:
+            spare[:, :count] = rays[i][:, :count]
+            for axis in (upright[0], -np.array(ray)):
+                start(other[0], axis, CONICAL, ray, middle, size)
+                found, rest = attempt(
+                    frame, circle, rank[i], size, (spare, count), upright, settings, other, work
+                )
+                if rest < BETTER * misfit:
+                    lines, misfit, rays[i][:, count:] = found, rest, spare[:, count:]
+                    caps[i], covariances[i] = other
+        if np.isfinite(misfit):
+            counts[i, 0], counts[i, 1], counts[i, 2], counts[i, 4] = n, m, lines, size
 
 
 @jit

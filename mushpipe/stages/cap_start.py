@@ -8,6 +8,8 @@ from mushpipe.core.jit import jit
 from mushpipe.stages.cap_model import BULGE, HEIGHT, RADIUS, Floats, N, Singles, Vector, span
 
 ASPECT = 0.62
+USUAL, CONICAL = (ASPECT, 0.0), (0.85, -0.1)  # aspect and bulge that a fit may start with
+RIM = 0.73  # depth of the rim plane below the middle of the visible part, in heights of the dome
 # The plane through a spheroid's visible points leans 1 - aspect^2 times as much as its axis.
 GAIN = 1 / (1 - ASPECT**2)
 STEEPEST = 0.9  # rad off the line of sight at which a fit may start
@@ -57,29 +59,41 @@ def lean(axis: Floats, ray: Vector) -> None:
 
 
 @jit
-def start(
-    cap: Floats, points: Singles, count: int, up: Floats, ray: Vector, middle: float, size: float
-) -> None:
-    """Fill a cap (15,) from the circle and the plane through its points.
+def axis_of(points: Singles, count: int, up: Floats, ray: Vector) -> Floats:
+    """Return the axis (3,) to start with: from the plane through points (6, M), `up` without one.
 
     Args:
-        cap: (15,) out.
         points: (6, M) unit rays and range, m.
         count: How many columns are points.
-        up: (3,) unit, the axis where the points have no plane.
+        up: (3,) unit.
         ray: Unit, through the circle's centre.
-        middle: Middle depth of the cap, m.
-        size: Radius of the circle at that depth, m.
     """
     axis = up.copy()
     if plane(points, count, ray, axis):
         lean(axis, ray)
+    return axis
+
+
+@jit
+def start(
+    cap: Floats, axis: Floats, form: tuple[float, float], ray: Vector, middle: float, size: float
+) -> None:
+    """Fill a cap (15,) from its circle.
+
+    Args:
+        cap: (15,) out.
+        axis: (3,) unit.
+        form: Aspect h/R and bulge.
+        ray: Unit, through the circle's centre.
+        middle: Middle depth of the cap, m.
+        size: Radius of the circle at that depth, m.
+    """
     for i in range(3):
-        cap[i] = ray[i] / ray[2] * (middle + 0.45 * size)
+        cap[i] = ray[i] / ray[2] * (middle + RIM * form[0] * size)
         cap[N + i] = axis[i]
     cap[RADIUS] = 1.03 * size
-    cap[HEIGHT] = ASPECT * cap[RADIUS]
-    cap[BULGE] = 0.0
+    cap[HEIGHT] = form[0] * cap[RADIUS]
+    cap[BULGE] = form[1]
     span(cap)
 
 
