@@ -37,9 +37,11 @@ from mushpipe.stages.cap_samples import (
 from mushpipe.stages.cap_solve import ROUND, Noise, invert, refine, tilt, workspace
 from mushpipe.stages.cap_start import CONICAL, USUAL, axis_of, spread_of, start
 
-POOR = 0.9  # a misfit (a usual cap has 0.25) at which a fit starts again from elsewhere,
-BETTER = 0.8  # and how much smaller another one must be
-ROUNDNESS = 0.015  # in rim radii: how far the rim of a cap is from the circle of its area
+POOR = 0.9  # misfit (a usual cap has 0.25) at which a fit starts again; it widens the sigmas, too
+BETTER = 0.8  # how much smaller the misfit of another start must be
+ROUNDNESS = 0.01  # in rim radii: how far the rim of a cap is from the circle of its area
+GUESSED = 0.1  # in rim radii: how far off an outline is that no depth edge confirms
+LEVER = 1.5  # rad of tilt per outline error in rim radii
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,14 +170,16 @@ def first_fits(
             continue
         size, count = circle[2] * middle / focal, ROUND + n + m
         ray = ray_at(image[1], focal, circle[0], circle[1])
-        axis = axis_of(rays[i][:, ROUND:], n, upright[0], ray)
+        points = rays[i][:, ROUND:]
+        axis = axis_of(points, n, upright[0], ray, USUAL[0])
         start(caps[i], axis, USUAL, ray, middle, size)
         lines, misfit = attempt(
             frame, circle, rank[i], size, (rays[i], count), upright, settings, fit, work
         )
         if misfit > POOR:
             spare[:, :count] = rays[i][:, :count]
-            for axis in (upright[0], -np.array(ray)):
+            leaning = axis_of(points, n, upright[0], ray, CONICAL[0])
+            for axis in (upright[0], -np.array(ray), leaning):
                 start(other[0], axis, CONICAL, ray, middle, size)
                 found, rest = attempt(
                     frame, circle, rank[i], size, (spare, count), upright, settings, other, work
@@ -283,6 +287,8 @@ def _fits(caps: Floats, covariances: Floats, surfaces: Floats, counts: Floats) -
     for array in (caps, covariances, surfaces):
         array[~valid] = np.nan
     diagonal = np.diagonal(covariances, axis1=1, axis2=2)
+    guessed = GUESSED * (1 - counts[:, 1] / DIRECTIONS) ** 5
+    doubt = np.maximum(counts[:, 5] / POOR, 1)
     center, axis = caps[:, :3], caps[:, N : N + 3]
     return Fits(
         valid,
@@ -293,8 +299,8 @@ def _fits(caps: Floats, covariances: Floats, surfaces: Floats, counts: Floats) -
         center + caps[:, HEIGHT, None] * axis,
         surfaces[:, :3],
         covariances,
-        np.sqrt(diagonal[:, 3] + diagonal[:, 4]),
-        np.sqrt(diagonal[:, 5] + (ROUNDNESS * caps[:, RADIUS]) ** 2),
+        doubt * np.sqrt(diagonal[:, 3] + diagonal[:, 4] + (LEVER * guessed) ** 2),
+        doubt * np.sqrt(diagonal[:, 5] + (ROUNDNESS**2 + guessed**2) * caps[:, RADIUS] ** 2),
         surfaces[:, 3:],
         np.where(valid, np.minimum(counts[:, 3] / len(CELLS), 1.0), np.nan),
         counts[:, 1].astype(np.int64),

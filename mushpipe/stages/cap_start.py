@@ -10,8 +10,6 @@ from mushpipe.stages.cap_model import BULGE, HEIGHT, RADIUS, Floats, N, Singles,
 ASPECT = 0.62
 USUAL, CONICAL = (ASPECT, 0.0), (0.85, -0.1)  # aspect and bulge that a fit may start with
 RIM = 0.73  # depth of the rim plane below the middle of the visible part, in heights of the dome
-# The plane through a spheroid's visible points leans 1 - aspect^2 times as much as its axis.
-GAIN = 1 / (1 - ASPECT**2)
 STEEPEST = 0.9  # rad off the line of sight at which a fit may start
 DEGREES = 4.0  # of freedom of Student's t: how readily a leaning cap is let go
 PRIOR_CAPS = 0.1  # the spread that is set counts as much as so many caps
@@ -44,8 +42,11 @@ def plane(points: Singles, count: int, ray: Vector, out: Floats) -> bool:
 
 
 @jit
-def lean(axis: Floats, ray: Vector) -> None:
-    """Turn an axis (3,) further away from the line of sight, as a cap leans more than its plane."""
+def lean(axis: Floats, ray: Vector, aspect: float) -> None:
+    """Turn an axis (3,) further away from the line of sight, as a cap leans more than its plane.
+
+    The plane through a spheroid's visible points leans 1 - aspect^2 times as much as its axis.
+    """
     cosine = -(axis[0] * ray[0] + axis[1] * ray[1] + axis[2] * ray[2])
     across = np.empty(3)
     for i in range(3):
@@ -53,13 +54,13 @@ def lean(axis: Floats, ray: Vector) -> None:
     sine = np.sqrt(across[0] ** 2 + across[1] ** 2 + across[2] ** 2)
     if sine < 1e-6:
         return
-    angle = min(np.arctan2(sine, cosine) * GAIN, STEEPEST)
+    angle = min(np.arctan2(sine, cosine) / (1.0 - aspect**2), STEEPEST)
     for i in range(3):
         axis[i] = across[i] / sine * np.sin(angle) - ray[i] * np.cos(angle)
 
 
 @jit
-def axis_of(points: Singles, count: int, up: Floats, ray: Vector) -> Floats:
+def axis_of(points: Singles, count: int, up: Floats, ray: Vector, aspect: float) -> Floats:
     """Return the axis (3,) to start with: from the plane through points (6, M), `up` without one.
 
     Args:
@@ -67,10 +68,11 @@ def axis_of(points: Singles, count: int, up: Floats, ray: Vector) -> Floats:
         count: How many columns are points.
         up: (3,) unit.
         ray: Unit, through the circle's centre.
+        aspect: h/R of the cap.
     """
     axis = up.copy()
     if plane(points, count, ray, axis):
-        lean(axis, ray)
+        lean(axis, ray, aspect)
     return axis
 
 
