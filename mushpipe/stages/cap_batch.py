@@ -26,6 +26,7 @@ from mushpipe.stages.cap_model import (
 from mushpipe.stages.cap_order import rank_by_depth
 from mushpipe.stages.cap_outline import sample_outline
 from mushpipe.stages.cap_samples import (
+    ASTRAY,
     CELLS,
     COMPASS,
     DIRECTIONS,
@@ -91,11 +92,17 @@ def gather(
     focal: float,
     sensor: tuple[float, float, float, float],
     rays: Singles,
-) -> tuple[int, int, float]:
-    """Take the rays of a cap; return numbers of points and edge rays, and its middle depth (m)."""
-    n, middle = sample_depth(image, rank, circle, focal, (sensor[0], sensor[1]), rays[:, ROUND:])
+) -> tuple[int, int, int, float]:
+    """Take the rays of a cap; return what there is of it.
+
+    Returns:
+        Numbers of its points, of points of other depth and of edge rays; its middle depth, m.
+    """
+    n, other, middle = sample_depth(
+        image, rank, circle, focal, (sensor[0], sensor[1]), rays[:, ROUND:]
+    )
     if n == 0:
-        return 0, 0, 0.0
+        return 0, other, 0, 0.0
     for j in range(ROUND, ROUND + n):
         rays[3, j] -= sensor[2] / rays[2, j]
     m = sample_edges(image, rank, circle, focal, middle, sensor[3], rays[:, ROUND + n :])
@@ -103,7 +110,7 @@ def gather(
         turn = COMPASS[j * (DIRECTIONS // ROUND)]
         x, y = circle[0] + circle[2] * turn[0], circle[1] + circle[2] * turn[1]
         touch(rays, j, ray_at(image[1], focal, x, y), 0.0, 0.0)
-    return n, m, middle - sensor[2]
+    return n, other, m, middle - sensor[2]
 
 
 @jit
@@ -156,16 +163,17 @@ def first_fits(
             in colour, px; fewest points.
         rays: (N, 6, ROOM) room for those of each cap.
         out: Per cap parameters, covariance, surface point with sigmas, and counts of points, edge
-            rays, outline rays, weight; size, m; and misfit. A cap without a fit keeps a count of 0.
+            rays, outline rays, weight; size, m; misfit; points of other depth. A cap without a fit
+            keeps a count of 0.
     """
     _, image, focal = frame
     caps, covariances, _, counts = out
     rank, work = rank_by_depth(image[0], circles, image[2]), workspace()
-    other = (np.empty(SIZE), np.empty((UNKNOWNS, UNKNOWNS)))
+    rival = (np.empty(SIZE), np.empty((UNKNOWNS, UNKNOWNS)))
     spare = np.empty((6, ROOM), np.float32)
     for i in range(len(circles)):
         circle, fit = circles[i], (caps[i], covariances[i])
-        n, m, middle = gather(image, circle, rank[i], focal, settings[1], rays[i])
+        n, other, m, middle = gather(image, circle, rank[i], focal, settings[1], rays[i])
         if n < settings[3] or middle <= 0.0:
             continue
         size, count = circle[2] * middle / focal, ROUND + n + m
@@ -180,15 +188,16 @@ def first_fits(
             spare[:, :count] = rays[i][:, :count]
             leaning = axis_of(points, n, upright[0], ray, CONICAL[0])
             for axis in (upright[0], -np.array(ray), leaning):
-                start(other[0], axis, CONICAL, ray, middle, size)
+                start(rival[0], axis, CONICAL, ray, middle, size)
                 found, rest = attempt(
-                    frame, circle, rank[i], size, (spare, count), upright, settings, other, work
+                    frame, circle, rank[i], size, (spare, count), upright, settings, rival, work
                 )
                 if rest < BETTER * misfit:
                     lines, misfit, rays[i][:, count:] = found, rest, spare[:, count:]
-                    caps[i], covariances[i] = other
+                    caps[i], covariances[i] = rival
         if np.isfinite(misfit):
             counts[i, 0], counts[i, 1], counts[i, 2], counts[i, 4] = n, m, lines, size
+            counts[i, 6] = other
 
 
 @jit
@@ -272,7 +281,7 @@ def fit_caps(
         np.full((n, SIZE), np.nan),
         np.full((n, UNKNOWNS, UNKNOWNS), np.nan),
         np.full((n, 6), np.nan),
-        np.zeros((n, 6)),
+        np.zeros((n, 7)),
     )
     rays = np.empty((n, 6, ROOM), np.float32)
     ranked = (gray, (*image, np.full(image[0].shape, n, np.int16)), focal)
@@ -288,6 +297,7 @@ def _fits(caps: Floats, covariances: Floats, surfaces: Floats, counts: Floats) -
         array[~valid] = np.nan
     diagonal = np.diagonal(covariances, axis1=1, axis2=2)
     guessed = GUESSED * (1 - counts[:, 1] / DIRECTIONS) ** 5
+    astray = counts[:, 6] > ASTRAY * (counts[:, 0] + counts[:, 6])
     doubt = np.maximum(counts[:, 5] / POOR, 1)
     center, axis = caps[:, :3], caps[:, N : N + 3]
     return Fits(
@@ -301,7 +311,7 @@ def _fits(caps: Floats, covariances: Floats, surfaces: Floats, counts: Floats) -
         covariances,
         doubt * np.sqrt(diagonal[:, 3] + diagonal[:, 4] + (LEVER * guessed) ** 2),
         doubt * np.sqrt(diagonal[:, 5] + (ROUNDNESS**2 + guessed**2) * caps[:, RADIUS] ** 2),
-        surfaces[:, 3:],
+        np.hypot(surfaces[:, 3:], np.where(astray, caps[:, RADIUS], 0)[:, None]),
         np.where(valid, np.minimum(counts[:, 3] / len(CELLS), 1.0), np.nan),
         counts[:, 1].astype(np.int64),
         counts[:, 2].astype(np.int64),
