@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from pose_scenes import SETS, circles_in, frames, truth_of
+from pose_scenes import SETS, frames, true_circles, truth_of
 
 from mushpipe import Circles, DepthSource, Locations, Mask, RgbdFrame
 from mushpipe.core.document import read_document
@@ -192,7 +192,7 @@ def steps(options: argparse.Namespace, detect: Callable[[RgbdFrame], Circles]) -
 def times(options: argparse.Namespace) -> None:
     """Print the CPU time of the stages on 150 mushrooms."""
     frame = frames(TIMED, 7, "a", 1, options.cache)[0]
-    found, _ = circles_in(truth_of(frame), 7, False)
+    found, _ = true_circles(frame)
     circles = found.take(np.argsort(-found.radius, kind="stable")[:150])
     surface, nearest, fuse, pick = SurfaceFit(), NearestDepth(), FuseDepth(), MakePicks()
     located = surface.process(frame, circles)

@@ -26,6 +26,7 @@ from mushpipe.stages.cap_model import (
 from mushpipe.stages.cap_order import rank_by_depth
 from mushpipe.stages.cap_outline import sample_outline
 from mushpipe.stages.cap_samples import (
+    ASTRAY,
     CELLS,
     COMPASS,
     DIRECTIONS,
@@ -35,9 +36,13 @@ from mushpipe.stages.cap_samples import (
     touch,
 )
 from mushpipe.stages.cap_solve import ROUND, Noise, invert, refine, tilt, workspace
-from mushpipe.stages.cap_start import spread_of, start
+from mushpipe.stages.cap_start import CONICAL, USUAL, axis_of, spread_of, start
 
-ROUNDNESS = 0.015  # in rim radii: how far the rim of a cap is from the circle of its area
+POOR = 0.9  # misfit (a usual cap has 0.25) at which a fit starts again; it widens the sigmas, too
+BETTER = 0.8  # how much smaller the misfit of another start must be
+ROUNDNESS = 0.01  # in rim radii: how far the rim of a cap is from the circle of its area
+GUESSED = 0.1  # in rim radii: how far off an outline is that no depth edge confirms
+LEVER = 1.5  # rad of tilt per outline error in rim radii
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,11 +92,17 @@ def gather(
     focal: float,
     sensor: tuple[float, float, float, float],
     rays: Singles,
-) -> tuple[int, int, float]:
-    """Take the rays of a cap; return numbers of points and edge rays, and its middle depth (m)."""
-    n, middle = sample_depth(image, rank, circle, focal, (sensor[0], sensor[1]), rays[:, ROUND:])
+) -> tuple[int, int, int, float]:
+    """Take the rays of a cap; return what there is of it.
+
+    Returns:
+        Numbers of its points, of points of other depth and of edge rays; its middle depth, m.
+    """
+    n, other, middle = sample_depth(
+        image, rank, circle, focal, (sensor[0], sensor[1]), rays[:, ROUND:]
+    )
     if n == 0:
-        return 0, 0, 0.0
+        return 0, other, 0, 0.0
     for j in range(ROUND, ROUND + n):
         rays[3, j] -= sensor[2] / rays[2, j]
     m = sample_edges(image, rank, circle, focal, middle, sensor[3], rays[:, ROUND + n :])
@@ -99,7 +110,42 @@ def gather(
         turn = COMPASS[j * (DIRECTIONS // ROUND)]
         x, y = circle[0] + circle[2] * turn[0], circle[1] + circle[2] * turn[1]
         touch(rays, j, ray_at(image[1], focal, x, y), 0.0, 0.0)
-    return n, m, middle - sensor[2]
+    return n, other, m, middle - sensor[2]
+
+
+@jit
+def attempt(
+    frame: Any, circle: Floats, rank: int, size: float, seen: tuple[Singles, int],
+    upright: tuple[Floats, float], settings: Any, fit: tuple[Floats, Floats], work: Any,
+) -> tuple[int, float]:  # fmt: skip
+    """Fit a cap from where it starts: to its depth, then to its outline in colour as well.
+
+    Args:
+        frame: As in `first_fits`.
+        circle: (3,) x, y, radius, px.
+        rank: Of the circle.
+        size: Its radius at the cap, m.
+        seen: The cap's rays (6, ROOM), with room for those of the outline, and how many there are.
+        upright: Unit vector (3,) and spread of tilts, rad.
+        settings: As in `first_fits`.
+        fit: Parameters (15,), in and out, and covariance (8, 8), out.
+        work: From `workspace`.
+
+    Returns:
+        Number of rays along the outline in colour, and the misfit, infinite without a solution.
+    """
+    gray, image, focal = frame
+    (rays, count), (cap, covariance), setting = seen, fit, (settings[0], 1.0 / focal, size)
+    if refine(cap, rays, count, upright, setting, (0, 2), work)[0] < 0.0:
+        return 0, np.inf
+    lines = sample_outline(
+        gray, image[1], image[2], rank, cap, circle, focal, settings[2], work[1], rays[:, count:]
+    )
+    total, misfit = refine(cap, rays, count + lines, upright, setting, (2, 4), work)
+    if total < 0.0:
+        return 0, np.inf
+    invert(work[0][0], covariance)
+    return lines, misfit
 
 
 @jit
@@ -117,31 +163,41 @@ def first_fits(
             in colour, px; fewest points.
         rays: (N, 6, ROOM) room for those of each cap.
         out: Per cap parameters, covariance, surface point with sigmas, and counts of points, edge
-            rays, outline rays, weight; size, m; and misfit. A cap without a fit keeps a count of 0.
+            rays, outline rays, weight; size, m; misfit; points of other depth. A cap without a fit
+            keeps a count of 0.
     """
-    gray, image, focal = frame
-    noise, sensor, outline_px, least = settings
+    _, image, focal = frame
     caps, covariances, _, counts = out
     rank, work = rank_by_depth(image[0], circles, image[2]), workspace()
+    rival = (np.empty(SIZE), np.empty((UNKNOWNS, UNKNOWNS)))
+    spare = np.empty((6, ROOM), np.float32)
     for i in range(len(circles)):
-        circle, seen = circles[i], rays[i]
-        n, m, middle = gather(image, circle, rank[i], focal, sensor, seen)
-        if n < least or middle <= 0.0:
+        circle, fit = circles[i], (caps[i], covariances[i])
+        n, other, m, middle = gather(image, circle, rank[i], focal, settings[1], rays[i])
+        if n < settings[3] or middle <= 0.0:
             continue
-        size = circle[2] * middle / focal
+        size, count = circle[2] * middle / focal, ROUND + n + m
         ray = ray_at(image[1], focal, circle[0], circle[1])
-        start(caps[i], seen[:, ROUND:], n, upright[0], ray, middle, size)
-        setting, count = (noise, 1.0 / focal, size), ROUND + n + m
-        if refine(caps[i], seen, count, upright, setting, (0, 2), work)[0] < 0.0:
-            continue
-        lines = sample_outline(
-            gray, image[1], image[2], rank[i], caps[i], circle, focal, outline_px, work[1],
-            seen[:, count:],
-        )  # fmt: skip
-        if refine(caps[i], seen, count + lines, upright, setting, (2, 4), work)[0] < 0.0:
-            continue
-        invert(work[0][0], covariances[i])
-        counts[i, 0], counts[i, 1], counts[i, 2], counts[i, 4] = n, m, lines, size
+        points = rays[i][:, ROUND:]
+        axis = axis_of(points, n, upright[0], ray, USUAL[0])
+        start(caps[i], axis, USUAL, ray, middle, size)
+        lines, misfit = attempt(
+            frame, circle, rank[i], size, (rays[i], count), upright, settings, fit, work
+        )
+        if misfit > POOR:
+            spare[:, :count] = rays[i][:, :count]
+            leaning = axis_of(points, n, upright[0], ray, CONICAL[0])
+            for axis in (upright[0], -np.array(ray), leaning):
+                start(rival[0], axis, CONICAL, ray, middle, size)
+                found, rest = attempt(
+                    frame, circle, rank[i], size, (spare, count), upright, settings, rival, work
+                )
+                if rest < BETTER * misfit:
+                    lines, misfit, rays[i][:, count:] = found, rest, spare[:, count:]
+                    caps[i], covariances[i] = rival
+        if np.isfinite(misfit):
+            counts[i, 0], counts[i, 1], counts[i, 2], counts[i, 4] = n, m, lines, size
+            counts[i, 6] = other
 
 
 @jit
@@ -225,7 +281,7 @@ def fit_caps(
         np.full((n, SIZE), np.nan),
         np.full((n, UNKNOWNS, UNKNOWNS), np.nan),
         np.full((n, 6), np.nan),
-        np.zeros((n, 6)),
+        np.zeros((n, 7)),
     )
     rays = np.empty((n, 6, ROOM), np.float32)
     ranked = (gray, (*image, np.full(image[0].shape, n, np.int16)), focal)
@@ -240,6 +296,9 @@ def _fits(caps: Floats, covariances: Floats, surfaces: Floats, counts: Floats) -
     for array in (caps, covariances, surfaces):
         array[~valid] = np.nan
     diagonal = np.diagonal(covariances, axis1=1, axis2=2)
+    guessed = GUESSED * (1 - counts[:, 1] / DIRECTIONS) ** 5
+    astray = counts[:, 6] > ASTRAY * (counts[:, 0] + counts[:, 6])
+    doubt = np.maximum(counts[:, 5] / POOR, 1)
     center, axis = caps[:, :3], caps[:, N : N + 3]
     return Fits(
         valid,
@@ -250,9 +309,9 @@ def _fits(caps: Floats, covariances: Floats, surfaces: Floats, counts: Floats) -
         center + caps[:, HEIGHT, None] * axis,
         surfaces[:, :3],
         covariances,
-        np.sqrt(diagonal[:, 3] + diagonal[:, 4]),
-        np.sqrt(diagonal[:, 5] + (ROUNDNESS * caps[:, RADIUS]) ** 2),
-        surfaces[:, 3:],
+        doubt * np.sqrt(diagonal[:, 3] + diagonal[:, 4] + (LEVER * guessed) ** 2),
+        doubt * np.sqrt(diagonal[:, 5] + (ROUNDNESS**2 + guessed**2) * caps[:, RADIUS] ** 2),
+        np.hypot(surfaces[:, 3:], np.where(astray, caps[:, RADIUS], 0)[:, None]),
         np.where(valid, np.minimum(counts[:, 3] / len(CELLS), 1.0), np.nan),
         counts[:, 1].astype(np.int64),
         counts[:, 2].astype(np.int64),

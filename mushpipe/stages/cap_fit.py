@@ -19,6 +19,7 @@ from mushpipe import (
 )
 from mushpipe.stages.cap_batch import Fits, fit_caps
 from mushpipe.stages.cap_solve import Noise
+from mushpipe.stages.surface_fit import HOLE_M, sources
 from mushpipe.stages.upright import Up, pixel_rays, upright
 
 Floats = NDArray[np.float64]
@@ -120,17 +121,14 @@ class CapFit(Stage):
 
 
 def _locations(fits: Fits, circles: Circles, depth: NDArray[np.float32]) -> Locations:
-    u, v = np.rint(circles.center).astype(int).T
-    height, width = depth.shape
-    inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    measured = inside & (depth[v.clip(0, height - 1), u.clip(0, width - 1)] > 0)
-    source = np.where(measured, DepthSource.MEASURED, DepthSource.NEIGHBOURS)
+    source = sources(circles, depth)
+    hidden = np.where(source == DepthSource.NEIGHBOURS, HOLE_M, 0)
     return Locations(
         position=fits.surface,
         distance=np.linalg.norm(fits.surface, axis=1),
         diameter=2 * fits.radius,
         source=np.where(fits.valid, source, DepthSource.MISSING).astype(np.uint8),
-        sigma_position=fits.sigma_surface,
+        sigma_position=np.hypot(fits.sigma_surface, hidden[:, None] * [0, 0, 1]),
         sigma_diameter=2 * fits.sigma_radius,
     )
 

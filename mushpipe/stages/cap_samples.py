@@ -23,6 +23,7 @@ INNER, OUTER = 0.55, 1.45  # where an edge is looked for, in radii of the circle
 EDGE_PX = 2.0  # sigma of a depth edge
 # Noise and errors of shape are correlated; so much of a point, or of a ray along an edge, counts.
 POINT_SHARE, EDGE_SHARE = 0.35 * 169 / GRID**2, 0.6
+ASTRAY = 1 / 3  # share of other depth in a circle: is what its centre shows the cap at all?
 CORE = 0.35  # squared share of the radius inside which the middle depth is taken
 
 _CENTERS = (np.arange(GRID) + 0.5) / GRID * 2 - 1
@@ -96,7 +97,7 @@ def sample_depth(
     focal: float,
     noise: tuple[float, float],
     out: Singles,
-) -> tuple[int, float]:
+) -> tuple[int, int, float]:
     """Take the points of a cap: block means on a grid inside its circle, gated around its depth.
 
     Args:
@@ -109,7 +110,8 @@ def sample_depth(
         out: (6, M) out: unit ray, range and its sigma (m), share that counts as independent.
 
     Returns:
-        Number of points, and the cap's middle depth (m), 0 where there is none.
+        Number of points, number of those outside of the gate, and the cap's middle depth (m), 0
+        where there is none.
     """
     depth, rays, ranks = image
     radius = circle[2]
@@ -123,9 +125,9 @@ def sample_depth(
         count[j] = block(depth, ranks, rank, (u, v, half), points[j])
     middle = middle_depth(points, count, half)
     if middle <= 0.0:
-        return 0, 0.0
+        return 0, 0, 0.0
     size = radius * middle / focal
-    n = 0
+    n, other = 0, 0
     for j in range(len(CELLS)):
         z = points[j, 2]
         sigma = noise[0] + noise[1] * z
@@ -133,6 +135,7 @@ def sample_depth(
         if count[j] <= 0.4 * full or points[j, 3] > even:
             continue
         if not middle - 0.8 * size < z < middle + size:
+            other += 1
             continue
         ray = ray_at(rays, focal, points[j, 0], points[j, 1])
         if ray[2] < 1e-3:
@@ -141,7 +144,7 @@ def sample_depth(
         out[4, n] = sigma * (0.3 + 0.7 / np.sqrt(count[j])) / ray[2]
         out[5, n] = POINT_SHARE
         n += 1
-    return n, middle
+    return n, other, middle
 
 
 @jit

@@ -8,8 +8,8 @@ from mushpipe.core.jit import jit
 from mushpipe.stages.cap_model import BULGE, HEIGHT, RADIUS, Floats, N, Singles, Vector, span
 
 ASPECT = 0.62
-# The plane through a spheroid's visible points leans 1 - aspect^2 times as much as its axis.
-GAIN = 1 / (1 - ASPECT**2)
+USUAL, CONICAL = (ASPECT, 0.0), (0.85, -0.1)  # aspect and bulge that a fit may start with
+RIM = 0.73  # depth of the rim plane below the middle of the visible part, in heights of the dome
 STEEPEST = 0.9  # rad off the line of sight at which a fit may start
 DEGREES = 4.0  # of freedom of Student's t: how readily a leaning cap is let go
 PRIOR_CAPS = 0.1  # the spread that is set counts as much as so many caps
@@ -42,8 +42,11 @@ def plane(points: Singles, count: int, ray: Vector, out: Floats) -> bool:
 
 
 @jit
-def lean(axis: Floats, ray: Vector) -> None:
-    """Turn an axis (3,) further away from the line of sight, as a cap leans more than its plane."""
+def lean(axis: Floats, ray: Vector, aspect: float) -> None:
+    """Turn an axis (3,) further away from the line of sight, as a cap leans more than its plane.
+
+    The plane through a spheroid's visible points leans 1 - aspect^2 times as much as its axis.
+    """
     cosine = -(axis[0] * ray[0] + axis[1] * ray[1] + axis[2] * ray[2])
     across = np.empty(3)
     for i in range(3):
@@ -51,35 +54,48 @@ def lean(axis: Floats, ray: Vector) -> None:
     sine = np.sqrt(across[0] ** 2 + across[1] ** 2 + across[2] ** 2)
     if sine < 1e-6:
         return
-    angle = min(np.arctan2(sine, cosine) * GAIN, STEEPEST)
+    angle = min(np.arctan2(sine, cosine) / (1.0 - aspect**2), STEEPEST)
     for i in range(3):
         axis[i] = across[i] / sine * np.sin(angle) - ray[i] * np.cos(angle)
 
 
 @jit
+def axis_of(points: Singles, count: int, up: Floats, ray: Vector, aspect: float) -> Floats:
+    """Return the axis (3,) to start with: from the plane through points (6, M), `up` without one.
+
+    Args:
+        points: (6, M) unit rays and range, m.
+        count: How many columns are points.
+        up: (3,) unit.
+        ray: Unit, through the circle's centre.
+        aspect: h/R of the cap.
+    """
+    axis = up.copy()
+    if plane(points, count, ray, axis):
+        lean(axis, ray, aspect)
+    return axis
+
+
+@jit
 def start(
-    cap: Floats, points: Singles, count: int, up: Floats, ray: Vector, middle: float, size: float
+    cap: Floats, axis: Floats, form: tuple[float, float], ray: Vector, middle: float, size: float
 ) -> None:
-    """Fill a cap (15,) from the circle and the plane through its points.
+    """Fill a cap (15,) from its circle.
 
     Args:
         cap: (15,) out.
-        points: (6, M) unit rays and range, m.
-        count: How many columns are points.
-        up: (3,) unit, the axis where the points have no plane.
+        axis: (3,) unit.
+        form: Aspect h/R and bulge.
         ray: Unit, through the circle's centre.
         middle: Middle depth of the cap, m.
         size: Radius of the circle at that depth, m.
     """
-    axis = up.copy()
-    if plane(points, count, ray, axis):
-        lean(axis, ray)
     for i in range(3):
-        cap[i] = ray[i] / ray[2] * (middle + 0.45 * size)
+        cap[i] = ray[i] / ray[2] * (middle + RIM * form[0] * size)
         cap[N + i] = axis[i]
     cap[RADIUS] = 1.03 * size
-    cap[HEIGHT] = ASPECT * cap[RADIUS]
-    cap[BULGE] = 0.0
+    cap[HEIGHT] = form[0] * cap[RADIUS]
+    cap[BULGE] = form[1]
     span(cap)
 
 

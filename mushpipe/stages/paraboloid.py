@@ -42,17 +42,18 @@ def fit_surfaces(
         out: Coefficients (N, 6) m and covariances (N, 6, 6); those without a fit stay as they are.
 
     Returns:
-        (N,) how many points of the whole grid have depth.
+        (N, 2) how many points of the whole grid have depth of the cap, and how many other depth.
     """
     rank = rank_by_depth(image[0], discs, image[2])
     near = np.empty((COEFFICIENTS + 2, len(INNER)))
-    seen = np.zeros(len(discs), np.int64)
+    seen = np.zeros((len(discs), 2), np.int64)
     for i in range(len(discs)):
         n, middle = sample_inner(image, rank[i], discs[i], focal, noise, near)
         size = discs[i, 2] * middle / focal
         if n >= least and paraboloid(near[:, :n], size, out[0][i], out[1][i]):
             out[0][i, 0] += middle
-            seen[i] = count_seen(image, rank[i], discs[i], (middle - 0.8 * size, middle + size))
+            gate = (middle - 0.8 * size, middle + size)
+            seen[i, 0], seen[i, 1] = count_seen(image, rank[i], discs[i], gate)
     return seen
 
 
@@ -109,16 +110,18 @@ def sample_inner(
 
 
 @jit
-def count_seen(image: Any, rank: int, disc: Floats, gate: tuple[float, float]) -> int:
-    """Return on how many points of the whole grid a cap has depth within its gate (m)."""
+def count_seen(image: Any, rank: int, disc: Floats, gate: tuple[float, float]) -> tuple[int, int]:
+    """Return on how many points of the grid depth lies within a cap's gate (m), and outside."""
     depth, _, ranks = image
-    count = 0
+    own, other = 0, 0
     for j in range(len(CELLS)):
         u = int(np.floor(disc[0] + disc[2] * CELLS[j, 0] + 0.5))
         v = int(np.floor(disc[1] + disc[2] * CELLS[j, 1] + 0.5))
         if 0 <= v < depth.shape[0] and 0 <= u < depth.shape[1] and ranks[v, u] >= rank:
-            count += gate[0] < depth[v, u] < gate[1]
-    return count
+            inside = gate[0] < depth[v, u] < gate[1]
+            own += inside
+            other += depth[v, u] > 0 and not inside
+    return own, other
 
 
 @jit

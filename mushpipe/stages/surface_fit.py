@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mushpipe import Camera, Circles, DepthSource, InputError, Locations, RgbdFrame, Stage
-from mushpipe.stages.cap_samples import CELLS
+from mushpipe.stages.cap_samples import ASTRAY, CELLS
 from mushpipe.stages.paraboloid import ASPECT, COEFFICIENTS, SHAPE_M, fit_surfaces
 from mushpipe.stages.upright import pixel_rays
 
@@ -16,6 +16,7 @@ ASPECT_SIGMA = 0.15
 LIP = 0.25  # what is below the rim's plane, over its radius
 OUTLINE = 0.008  # sigma of a cap's diameter about that of its outline, relative
 WHOLE = 0.85  # share of the grid that finds depth on a cap which nothing hides
+HOLE_M = 0.0004  # sigma of what a hole at the centre hides: the tip of a pointed cap
 STEEPEST = np.radians(60)
 SLOPE = np.radians(10)  # sigma of the tilt that a slope shows: caps are neither even nor round
 SPREAD = np.radians(15)  # of the tilts in a bed about what they have in common, per direction
@@ -65,17 +66,21 @@ class SurfaceFit(Stage):
         slope = surface[:, 1:3] / size[:, None]
         ray = frame.camera.deproject(circles.center, np.ones(len(circles)))
         position = ray * surface[:, :1]
+        own, other = seen.T
+        source = sources(circles, depth)
         along = covariance[:, 0, 0] + SHAPE_M**2 + (slope**2).sum(axis=1) * pixel**2
+        along += np.where(source == DepthSource.NEIGHBOURS, HOLE_M**2, 0)
+        along += np.where(other > ASTRAY * (own + other), size**2, 0)
         diameter, sigma_diameter = diameters(surface, covariance, size, ray)
         # what is hidden of an outline was guessed by the detector
-        whole = np.minimum(seen / (WHOLE * len(CELLS)), 1) ** 2
+        whole = np.minimum(own / (WHOLE * len(CELLS)), 1) ** 2
         sigma_diameter = np.hypot(sigma_diameter, 2 * pixel) / np.maximum(whole, 1e-3)
         known = np.isfinite(position).all(axis=1)
         return Locations(
             position=position,
             distance=np.linalg.norm(position, axis=1),
             diameter=diameter,
-            source=np.where(known, sources(circles, depth), DepthSource.MISSING),
+            source=np.where(known, source, DepthSource.MISSING),
             sigma_position=np.column_stack([pixel, pixel, np.sqrt(along)]),
             sigma_diameter=sigma_diameter,
         )
@@ -83,7 +88,7 @@ class SurfaceFit(Stage):
     def fit(
         self, depth: NDArray[np.float32], camera: Camera, discs: Floats
     ) -> tuple[Floats, Floats, NDArray[np.int64]]:
-        """Return coefficients (N, 6), m, their covariances (N, 6, 6) and numbers of points (N,).
+        """Return coefficients (N, 6), m, covariances (N, 6, 6) and numbers of points (N, 2).
 
         Args:
             depth: (H, W) m, 0 = missing, finite.

@@ -72,6 +72,33 @@ def draw(caps: list[Cap], bed: float, camera: Camera = CAMERA) -> tuple[np.ndarr
     return depth[0], color
 
 
+def draw_pointed(c: Cap, power: float, bed: float) -> tuple[np.ndarray, np.ndarray]:
+    """Depth and luma of a cap (rho/R)^power + (s/h)^power = 1 over its rim, by bisection."""
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width].astype(float)
+    rays = CAMERA.deproject(np.stack([u, v], axis=-1), np.ones(u.shape))
+
+    def inside(z: np.ndarray) -> np.ndarray:
+        q = rays * z[..., None] - c.center
+        s = q @ c.axis
+        rho = np.sqrt(np.maximum((q**2).sum(-1) - s**2, 0)) / c.radius
+        high = np.where(s > 0, s / c.height, -s / (LIP * c.radius))
+        bend = np.where(s > 0, power, 2.0)
+        return rho**bend + high**bend < 1
+
+    steps = np.linspace(c.center[2] - 2 * c.radius, c.center[2] + 2 * c.radius, 200)
+    deep = np.full(u.shape, np.inf)
+    for z in steps:
+        deep = np.where(np.isinf(deep) & inside(np.full(u.shape, z)), z, deep)
+    hit = np.isfinite(deep)
+    deep = np.where(hit, deep, bed)
+    near = deep - (steps[1] - steps[0])
+    for _ in range(14):
+        middle = (near + deep) / 2
+        within = inside(middle)
+        near, deep = np.where(within, near, middle), np.where(within, middle, deep)
+    return np.where(hit, deep, bed), np.where(hit, 0.8, 0.2)
+
+
 def frame_from(depth: np.ndarray, gray: np.ndarray, camera: Camera | None = CAMERA) -> RgbdFrame:
     color = np.repeat(np.rint(gray * 255).astype(np.uint8)[..., None], 3, axis=2)
     native = np.nan_to_num(depth).astype(np.float32)
@@ -80,8 +107,12 @@ def frame_from(depth: np.ndarray, gray: np.ndarray, camera: Camera | None = CAME
 
 def circle_of(c: Cap, camera: Camera = CAMERA) -> tuple[float, float, float]:
     """Centroid and equal-area radius of the outline of a cap that nothing hides."""
-    depth, _ = draw([c], 10.0, camera)
-    v, u = np.nonzero(depth < 10.0)
+    return circle_around(draw([c], 10.0, camera)[0] < 10.0)
+
+
+def circle_around(shape: np.ndarray) -> tuple[float, float, float]:
+    """Centroid and equal-area radius of the pixels that are true."""
+    v, u = np.nonzero(shape)
     return float(u.mean()), float(v.mean()), float(np.sqrt(len(u) / np.pi))
 
 

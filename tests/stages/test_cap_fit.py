@@ -10,7 +10,16 @@ from mushpipe import Camera, Circles, DepthSource, InputError, Locations, Poses,
 from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.cap_model import ROOM, SIZE, fill_rows, move, span
 from mushpipe.stages.upright import pixel_rays, upright
-from tests.stages.caps import CAMERA, Cap, cap, circles_of, draw, frame_from
+from tests.stages.caps import (
+    CAMERA,
+    Cap,
+    cap,
+    circle_around,
+    circles_of,
+    draw,
+    draw_pointed,
+    frame_from,
+)
 
 EXACT = {"depth_noise_mm": 0.02, "depth_noise_per_m": 0.0, "edge_offset_px": 0.0, "tilt_deg": 60}
 
@@ -87,6 +96,28 @@ def test_a_nearer_cap_hides_its_part_of_the_one_below() -> None:
     assert angle(poses.axis[0], low.axis) < 3
     assert locations.diameter[0] == pytest.approx(0.044, abs=1.5e-3)
     assert angle(poses.axis[1], high.axis) < 2
+
+
+@pytest.mark.parametrize("power", [1.2, 1.35])
+def test_a_high_pointed_cap_that_leans_is_not_taken_for_a_small_upright_one(power: float) -> None:
+    true = cap(45, 60, (0, 0, 0.4), 0.022, 0.95)
+    depth, gray = draw_pointed(true, power, 0.45)
+    x, y, radius = circle_around(depth < 0.45)
+    stage = CapFit(up="camera", edge_offset_px=0)
+    locations, poses = stage.process(frame_from(depth, gray), Circles([[x, y]], [radius], [1.0]))
+    assert angle(poses.axis[0], true.axis) < 3
+    assert locations.diameter[0] == pytest.approx(0.044, abs=2e-3)
+
+
+def test_an_outline_that_no_depth_edge_confirms_widens_the_sigmas() -> None:
+    true = cap(15, 60, (0, 0, 0.4), 0.022, 0.55)
+    depth, gray = draw([true], 0.44)
+    stage, circles = CapFit(up="camera"), circles_of([true])
+    with_edges, seen = stage.process(frame_from(depth, gray), circles)
+    alone = np.where(depth < 0.44, depth, np.nan)
+    without, guessed = stage.process(frame_from(alone, gray), circles)
+    assert without.sigma_diameter[0] > 2 * with_edges.sigma_diameter[0]
+    assert guessed.sigma_rad[0] > 1.5 * seen.sigma_rad[0]
 
 
 def test_the_bed_says_what_is_up() -> None:

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mushpipe import Camera, Circles, DepthSource, InputError, Locations, RgbdFrame
+from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.paraboloid import invert
 from mushpipe.stages.surface_fit import SurfaceFit
 from tests.stages.caps import CAMERA, Cap, cap, circles_of, draw, frame_from
@@ -81,6 +82,18 @@ def test_a_nearer_cap_is_not_taken_for_the_one_it_hides() -> None:
     alone = locate(draw([below], BED)[0], circles.take(np.array([0])))
     assert found.position[0, 2] == pytest.approx(alone.position[0, 2], abs=5e-4)
     assert found.sigma_diameter[0] > 1.2 * alone.sigma_diameter[0]
+
+
+@pytest.mark.parametrize("stage", [SurfaceFit(), CapFit(up="camera")])
+def test_a_centre_that_shows_an_undetected_cap_is_in_doubt(stage: SurfaceFit | CapFit) -> None:
+    low = cap(0, 0, (0, 0, 0.48), 0.022, 0.6)
+    high = cap(0, 0, (0.009, 0, 0.45), 0.016, 0.6)
+    circles = circles_of([low])
+    found = stage.process(frame_from(draw([low, high], BED)[0], GRAY), circles)
+    located = found if isinstance(found, Locations) else found[0]
+    error = located.position[0, 2] - surface_z([low], circles)[0]
+    assert abs(error) < 2 * located.sigma_position[0, 2]
+    assert abs(error) > 0.01
 
 
 def test_noise_stays_below_the_stated_sigma_and_moves_nothing() -> None:
