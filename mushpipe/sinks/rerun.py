@@ -80,7 +80,9 @@ class RerunSink(Sink):
 
         from mushpipe.sinks.rerun_log import log_start
 
-        sinks: list[Any] = [rr.FileSink(str(run.path(self.save)))] if self.save else []
+        sinks: list[Any] = []
+        if self.save:  # an index of what it holds would stay in memory to the end of the run
+            sinks.append(rr.FileSink(str(run.path(self.save)), write_footer=False))
         sinks += [rr.GrpcSink(url) for url in self._viewers()]
         if not sinks:
             raise UsageError("nothing to do: set 'save', 'spawn', 'connect' or 'serve'")
