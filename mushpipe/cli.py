@@ -13,6 +13,7 @@ import typer
 
 from mushpipe.doctor import register as register_doctor
 from mushpipe.evaluate.cli import register as register_eval
+from mushpipe.output import Output, OutputOption
 from mushpipe.proof.cli import register as register_proof
 from mushpipe.record import register as register_record
 from mushpipe.robot.commands import app as robot_app
@@ -51,13 +52,6 @@ class Drawing(StrEnum):
 
     mermaid = "mermaid"
     dot = "dot"
-
-
-class Output(StrEnum):
-    """Formats of listings."""
-
-    text = "text"
-    json = "json"
 
 
 class Export(StrEnum):
@@ -130,7 +124,7 @@ def validate(
     graph: GraphArgument,
     source: SourceOption = None,
     set_: SetOption = None,
-    output: Annotated[Output, typer.Option("--format")] = Output.text,
+    output: OutputOption = Output.text,
 ) -> None:
     """Check a graph file without running it; report every fault at once."""
     from dataclasses import asdict
@@ -166,7 +160,7 @@ def graph(
 @app.command()
 def info(
     file: Annotated[Path, typer.Argument(help="recording or results")],
-    output: Annotated[Output, typer.Option("--format")] = Output.text,
+    output: OutputOption = Output.text,
 ) -> None:
     """Tell what a recording holds, and whether it is whole."""
     from mushpipe.info import describe, render
@@ -204,7 +198,7 @@ def schema(
 
 @plugins_app.command("list")
 def plugins_list(
-    output: Annotated[Output, typer.Option("--format")] = Output.text,
+    output: OutputOption = Output.text,
 ) -> None:
     """List stages, sources and sinks, and plugins that failed to load."""
     from mushpipe.core.plugins import load_registry

@@ -123,7 +123,8 @@ def show_report(report: RunReport) -> None:
     """Print the time per stage, the balance, and what was lost."""
     if report.frame.count:
         summary = report.summary()
-        stderr.print(durations_table({**summary["durations"], "all stages": summary["frame"]}))
+        beside = {"all stages": summary["frame"], "latency": summary["latency"]}
+        stderr.print(durations_table({**summary["durations"], **beside}))
     rate = report.processed / report.elapsed_s if report.elapsed_s else 0.0
     stderr.print(
         f"{report.frames_in} frames in = {report.processed} processed + {report.dropped} dropped "

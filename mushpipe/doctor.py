@@ -19,6 +19,8 @@ from typing import Annotated
 
 import typer
 
+from mushpipe.output import Output, OutputOption
+
 _PACKAGES = ("mushpipe", "numpy", "opencv-python-headless", "scipy", "numba", "mcap", "rerun-sdk")
 # 640x480 colour and depth at 30 frames/s, as `mushpipe record` stores them
 _NEEDED_MB_S = 20.0
@@ -45,13 +47,6 @@ class Finding:
     cure: str = ""
 
 
-class Form(StrEnum):
-    """How the findings are printed."""
-
-    text = "text"
-    json = "json"
-
-
 CameraOption = Annotated[
     bool, typer.Option("--camera", "--device", help="a camera must be there: exit with 5 if not")
 ]
@@ -66,7 +61,7 @@ def register(app: typer.Typer) -> None:
 def doctor(
     camera: CameraOption = False,
     folder: FolderOption = Path(),
-    output: Annotated[Form, typer.Option("--format")] = Form.text,
+    output: OutputOption = Output.text,
 ) -> None:
     """Look at this computer, its libraries and its cameras; say what is wrong and what to do."""
     from mushpipe.core.errors import EXIT_FAILED, EXIT_NO_DEVICE, EXIT_OK
@@ -77,7 +72,7 @@ def doctor(
     findings += [*cameras, *_without_permission()]
     if not cameras:
         findings.append(_no_camera(State.error if camera else State.note))
-    if output is Form.json:
+    if output is Output.json:
         sys.stdout.write(json.dumps([asdict(finding) for finding in findings]) + "\n")
     else:
         _show(findings)

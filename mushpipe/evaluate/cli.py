@@ -6,24 +6,18 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterable
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from mushpipe.output import Output, OutputOption
 
 if TYPE_CHECKING:
     from mushpipe.core.plan import Plan
     from mushpipe.core.report import RunReport
     from mushpipe.evaluate.command import Request
     from mushpipe.evaluate.judging import Rules
-
-
-class Form(StrEnum):
-    """How the outcome is printed."""
-
-    text = "text"
-    json = "json"
 
 
 TargetsArgument = Annotated[
@@ -116,7 +110,7 @@ def evaluate(
     seed: SeedOption = 0,
     out: OutOption = None,
     report: ReportOption = None,
-    output: Annotated[Form, typer.Option("--format")] = Form.text,
+    output: OutputOption = Output.text,
 ) -> None:
     """Judge results against the truth, or run a graph and judge that."""
     from mushpipe.console import set_up_logging
@@ -134,7 +128,7 @@ def evaluate(
     raise typer.Exit(_judge(request, out, report, output))
 
 
-def _judge(request: Request, out: Path | None, report: Path | None, output: Form) -> int:
+def _judge(request: Request, out: Path | None, report: Path | None, output: Output) -> int:
     from mushpipe.evaluate.command import perform
 
     if out is not None:
@@ -142,7 +136,7 @@ def _judge(request: Request, out: Path | None, report: Path | None, output: Form
     # Frames for the page may stand in the temporary results, so those live until it is written.
     with tempfile.TemporaryDirectory(prefix="mushpipe-eval-") as temporary:
         judgement = perform(request, out or Path(temporary), _run)
-        if output is Form.json:
+        if output is Output.json:
             from mushpipe.evaluate.plain import judgement_json
 
             _write(judgement_json(judgement))
@@ -159,12 +153,12 @@ def _judge(request: Request, out: Path | None, report: Path | None, output: Form
 
 
 def _planes(
-    files: list[Path], plane: str, thresholds: list[str], rules: Rules, output: Form
+    files: list[Path], plane: str, thresholds: list[str], rules: Rules, output: Output
 ) -> int:
     from mushpipe.evaluate.plane import judge_planes
 
     rows, outcomes, code = judge_planes(files, plane, thresholds, rules.resamples, rules.seed)
-    if output is Form.json:
+    if output is Output.json:
         from mushpipe.evaluate.plain import planes_json
 
         _write(planes_json(rows, outcomes, code))

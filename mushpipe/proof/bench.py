@@ -56,6 +56,7 @@ def bench(plan_of: Callable[[int], Plan], frames: int) -> dict[str, Any]:
         "memory_growth_mb": round(memory.growth_mb(), 2),
         "nodes": summary["durations"],
         "frame": summary["frame"],
+        "latency": summary["latency"],
     }
 
 

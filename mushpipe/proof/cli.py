@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -73,6 +74,9 @@ def bench(
         str | None, typer.Argument(help="recording to play in place of the graph's source")
     ] = None,
     frames: Annotated[int, typer.Option(help="frames to measure", min=10)] = 300,
+    speed: Annotated[
+        float, typer.Option(min=0, help="pace of the replay: 1 is real time, 0 as fast as it goes")
+    ] = 0.0,
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="A.B=VALUE", help="change a setting")
     ] = None,
@@ -84,15 +88,19 @@ def bench(
         float, typer.Option(help="exit with 3 where a median is more times the baseline's", min=1)
     ] = 1.5,
 ) -> None:
-    """Measure a graph: time of every node, frames/s, CPU, memory. It plays as fast as it goes."""
+    """Measure a graph: time of every node, latency, frames/s, CPU, memory."""
     from mushpipe.console import set_up_logging
+    from mushpipe.core.document import read_document
     from mushpipe.core.errors import EXIT_DIFFERS
+    from mushpipe.core.graph import compile_document
+    from mushpipe.core.plugins import load_registry
     from mushpipe.proof.bench import bench as measure
     from mushpipe.proof.bench import read_baseline, slower
 
     set_up_logging(False)
     before = read_baseline(baseline) if baseline else None
-    result = measure(lambda count: _plan(graph, recording, count, set_ or []), frames)
+    plan = compile_document(read_document(graph), load_registry(), set_ or [], recording)
+    result = measure(lambda count: _endless(plan, count, speed), frames)
     ratios = slower(result, before) if before else {}
     _show(result, ratios)
     if out is not None:
@@ -100,22 +108,12 @@ def bench(
     raise typer.Exit(EXIT_DIFFERS if max(ratios.values(), default=0.0) > allow else 0)
 
 
-def _plan(graph: Path, recording: str | None, frames: int, overrides: list[str]) -> Plan:
-    """Compile a graph that plays its recording over and over, unpaced, up to so many frames."""
-    from mushpipe.core.document import read_document
-    from mushpipe.core.graph import compile_document
-    from mushpipe.core.plugins import load_registry
-
-    registry = load_registry()
-    settings = type(
-        compile_document(read_document(graph), registry, overrides, recording).source.plugin
-    ).model_fields
-    endless = [
-        f"source.{name}={value}"
-        for name, value in {"loop": 0, "speed": 0, "max_frames": frames}.items()
-        if name in settings
-    ]
-    return compile_document(read_document(graph), registry, [*overrides, *endless], recording)
+def _endless(plan: Plan, frames: int, speed: float) -> Plan:
+    """Return a plan that plays its recording over and over, up to so many frames."""
+    wanted = {"loop": 0, "speed": speed, "max_frames": frames}
+    plugin = plan.source.plugin
+    known = {name: value for name, value in wanted.items() if name in type(plugin).model_fields}
+    return replace(plan, source=replace(plan.source, plugin=plugin.model_copy(update=known)))
 
 
 def _show(result: dict[str, Any], ratios: dict[str, float]) -> None:
@@ -124,7 +122,8 @@ def _show(result: dict[str, Any], ratios: dict[str, float]) -> None:
     from mushpipe.console import durations_table
 
     console = Console(file=sys.stdout, highlight=False, soft_wrap=True)
-    console.print(durations_table({**result["nodes"], "all stages": result["frame"]}, ratios))
+    beside = {"all stages": result["frame"], "latency": result["latency"]}
+    console.print(durations_table({**result["nodes"], **beside}, ratios))
     machine = result["machine"]
     console.print(f"{machine['cores']} cores of {machine['processor']}, Python {machine['python']}")
     for name in _FIGURES:

@@ -26,8 +26,10 @@ class McapSink(Sink):
     delivery: ClassVar[Literal["every", "latest"]] = "every"
 
     path: GraphPath = Field(description="file to write; {recording} is the name of the input")
-    frames: bool = Field(
-        True, description="record colour and depth, also those that stages made, beside the results"
+    frames: bool | Literal["source"] = Field(
+        True,
+        description="record colour and depth beside the results, also those that stages made; "
+        "`source` leaves the latter out: the graph makes them again",
     )
     jpeg_quality: int | None = Field(
         None, ge=1, le=100, description="store colour as JPEG of this quality; lossless if not set"
@@ -77,7 +79,7 @@ class McapSink(Sink):
         writer, frame = self._next_writer(), trace.frame
         if self.frames:
             writer.frame(frame, self.jpeg_quality)
-        results = result_messages(trace, self._unknown, self.drawings, self.frames)
+        results = result_messages(trace, self._unknown, self.drawings, self.frames is True)
         for topic, message in results:
             writer.write(topic, message, frame.header)
         if self.timing and trace.durations_ns:

@@ -36,31 +36,29 @@ def result_messages(
             # Several outputs of one stage need several topics; the first keeps the stage's own.
             own = "" if value is values[0] else f"/{type(value).__name__.lower()}"
             topic = f"{wire.RESULT_PREFIX}{stage}{own}"
-            messages = encoder(value, trace.frame.header)
             if isinstance(value, RgbdFrame):
-                messages = _made(value, messages, last) if images else iter(())
+                messages = _made(value, last) if images else iter(())
                 last = value
+            else:
+                messages = encoder(value, trace.frame.header)
             for message in messages:
                 yield topic + message.suffix, message
             for message in drawings(value, trace.frame.header) if drawn else ():
                 yield topic + message.suffix, message
 
 
-def _made(
-    frame: RgbdFrame, messages: Iterator[wire.Message], last: RgbdFrame
-) -> Iterator[wire.Message]:
+def _made(frame: RgbdFrame, last: RgbdFrame) -> Iterator[wire.Message]:
     """Yield the images of a frame that the one before it in the graph does not have.
 
     Who reads them carries the others on; colour says where there is no depth to carry on.
     """
-    for message in messages:
-        if message.suffix == "/depth":
-            if frame.depth is not last.depth:
-                yield message
-        elif frame.depth is None:
-            yield message._replace(metadata=wire.NO_DEPTH)
-        elif frame.color is not last.color:
-            yield message
+    if frame.depth is None:
+        yield wire.encode_color(frame)._replace(suffix="/color", metadata=wire.NO_DEPTH)
+        return
+    if frame.color is not last.color:
+        yield wire.encode_color(frame)._replace(suffix="/color")
+    if frame.depth is not last.depth:
+        yield wire.encode_depth(frame)._replace(suffix="/depth")
 
 
 def timing_message(trace: Trace) -> Published:

@@ -23,6 +23,7 @@ from mushpipe.core.transform import Transform
 logger = logging.getLogger("mushpipe")
 PORT = 9876  # the SDK's own default
 PATIENCE_S = 20.0
+LIVE_IMAGE_HZ = 5.0
 
 
 class RerunSink(Sink):
@@ -49,8 +50,8 @@ class RerunSink(Sink):
         "127.0.0.1", description="address that `serve` listens on; 0.0.0.0 lets everybody in"
     )
     memory: str = Field("1GB", description="what the viewer or server of `spawn` and `serve` keeps")
-    image_hz: float = Field(
-        5.0, gt=0, description="most images per second of a live run; a replay shows all"
+    image_hz: float | None = Field(
+        None, gt=0, description="most images per second; not set: 5 of a live run, all of a replay"
     )
     jpeg_quality: int = Field(85, ge=1, le=100, description="quality of the stored colour images")
     cloud_step: int = Field(3, ge=1, description="pixels between the points of the cloud")
@@ -88,7 +89,8 @@ class RerunSink(Sink):
         graph = run.manifest.get("graph", {})
         self._base = _base(graph)
         log_start(self._recording, _workspace(graph), self._base)
-        self._period_ns = round(1e9 / self.image_hz) if run.live else 0
+        image_hz = self.image_hz or (LIVE_IMAGE_HZ if run.live else None)
+        self._period_ns = round(1e9 / image_hz) if image_hz else 0
         self._notes = _Notes()
         logger.addHandler(self._notes)
 

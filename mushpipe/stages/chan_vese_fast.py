@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from mushpipe.core.jit import inlined, jit
 
+Floats = NDArray[np.float64]
 Plane = NDArray[np.float32]
 Planes = NDArray[np.float32]
 Bits = NDArray[np.uint8]  # 1 inside, 0 outside; a quarter of the memory that floats would need
@@ -143,31 +144,59 @@ def _pull(above: Plane, here: Plane, below: Plane, x: int, a: np.float32, b: np.
     return a * axial + b * (above[x] + above[x + 2] + below[x] + below[x + 2])
 
 
-class _Regions:
-    """The two means of a region, and the force they exert on each pixel."""
+@jit
+def _means(planes: Planes, u: Bits, c1: Floats, c2: Floats, known: bool) -> int:
+    """Write the means of the two sides, unless they are known; return the pixels inside."""
+    inside = 0
+    for k in range(len(planes)):
+        inside, total, everything = region_sums(planes[k], u)
+        if not known:
+            c1[k] = total / max(1, inside)
+            c2[k] = (everything - total) / max(1, u.size - inside)
+    return inside
 
-    def __init__(self, planes: Planes, u: Bits, levels: Levels | None) -> None:
-        self.planes = planes
-        self.levels = levels
-        self.update(u)
 
-    def update(self, u: Bits) -> None:
-        sums = [region_sums(plane, u) for plane in self.planes]
-        self.inside = sums[0][0]
-        outside = max(1, u.size - self.inside)
-        self.c1 = np.array([total / max(1, self.inside) for _, total, _ in sums])
-        self.c2 = np.array([(everything - total) / outside for _, total, everything in sums])
-        self.one_sided = self.inside in (0, u.size)
-        if self.levels is not None:
-            self.c1, self.c2 = (np.full(len(sums), level) for level in self.levels)
+@jit
+def _force(planes: Planes, c1: Floats, c2: Floats, mixed: Plane) -> tuple[Plane, float, float]:
+    """Return P, gain and offset of |I - c2|^2 - |I - c1|^2 = gain P + offset; mixed is scratch."""
+    count = len(planes)
+    gain, offset = 2 * (c1 - c2) / count, ((c2 * c2).sum() - (c1 * c1).sum()) / count
+    if count == 1:
+        return planes[0], gain[0], offset
+    mixed[:] = 0
+    for k in range(count):
+        mixed += np.float32(gain[k]) * planes[k]
+    return mixed, 1.0, offset
 
-    def force(self) -> tuple[Plane, float, float]:
-        """Return P, gain and offset of |I - c2|^2 - |I - c1|^2 = gain P + offset."""
-        gain = 2 * (self.c1 - self.c2) / len(self.planes)
-        offset = float(self.c2 @ self.c2 - self.c1 @ self.c1) / len(self.planes)
-        if len(self.planes) == 1:
-            return self.planes[0], float(gain[0]), offset
-        return np.tensordot(gain.astype(np.float32), self.planes, 1), 1.0, offset
+
+@jit
+def _solve_level(
+    planes: Planes, u: Bits, mu: float, c1: Floats, c2: Floats, known: bool, most: tuple[int, int]
+) -> Bits:
+    """Run at most so many ICTM iterations and sweeps of descent on a region, which is changed.
+
+    One kernel, since each return to Python may have to wait for other threads.
+    """
+    other, mixed = np.empty_like(u), np.empty_like(planes[0])
+    pull = mu * math.sqrt(2 * math.pi) / SIGMA
+    inside = _means(planes, u, c1, c2, known)
+    for _ in range(most[0]):
+        if inside == 0 or inside == u.size:
+            break
+        plane, gain, offset = _force(planes, c1, c2, mixed)
+        changed = ictm_sweep(plane, u, other, _TAPS, gain, offset, pull)
+        u, other = other, u
+        if changed == 0:
+            break
+        inside = _means(planes, u, c1, c2, known)
+    for _ in range(most[1]):
+        if inside == 0 or inside == u.size:
+            break
+        plane, gain, offset = _force(planes, c1, c2, mixed)
+        if icm_sweep(plane, u, gain, offset, mu) == 0:
+            break
+        inside = _means(planes, u, c1, c2, known)
+    return u
 
 
 def solve_fast(
@@ -191,7 +220,8 @@ def solve_fast(
             moves any more.
         sweeps: Most sweeps of descent at full resolution, four times more per level.
     """
-    planes = np.stack(cv2.split(image)) if image.ndim == 3 else image[None]
+    # A copy: read-only planes would be a type of their own to the compiler.
+    planes = np.stack(cv2.split(image)) if image.ndim == 3 else image[None].copy()
     bits = initial.view(np.uint8)
     return _pyramid(planes, bits, mu, levels, depth, iterations, sweeps).view(np.bool_)
 
@@ -216,32 +246,7 @@ def _pyramid(
         u = np.asarray(cv2.resize(solved, (width, height)), np.uint8)
     else:
         u = initial.copy()
-    regions = _Regions(planes, u, levels)
-    u = _ictm(regions, u, mu, iterations)
-    _descend(regions, u, mu, sweeps)
-    return u
-
-
-def _ictm(regions: _Regions, u: Bits, mu: float, iterations: int) -> Bits:
-    other = np.empty_like(u)
-    pull = mu * math.sqrt(2 * math.pi) / SIGMA
-    for _ in range(iterations):
-        if regions.one_sided:
-            break
-        plane, gain, offset = regions.force()
-        changed = ictm_sweep(plane, u, other, _TAPS, gain, offset, pull)
-        u, other = other, u
-        if not changed:
-            break
-        regions.update(u)
-    return u
-
-
-def _descend(regions: _Regions, u: Bits, mu: float, sweeps: int) -> None:
-    for _ in range(sweeps):
-        if regions.one_sided:
-            break
-        plane, gain, offset = regions.force()
-        if not icm_sweep(plane, u, gain, offset, mu):
-            break
-        regions.update(u)
+    c1, c2 = (np.full(len(planes), level) for level in levels or (0.0, 0.0))
+    return np.asarray(
+        _solve_level(planes, u, mu, c1, c2, levels is not None, (iterations, sweeps)), np.uint8
+    )

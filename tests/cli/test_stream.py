@@ -19,7 +19,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mushpipe import Header, RgbdFrame, Stage
+from mushpipe import Header, RgbdFrame
 from mushpipe.core.errors import (
     EXIT_DAMAGED,
     EXIT_FAILED,
@@ -35,7 +35,7 @@ from mushpipe.sources.mcap import McapSource
 from mushpipe.sources.stream import StreamSource
 from tests.cli.test_commands import ROOT, mushpipe
 from tests.cli.test_record import CAMERA, MAIN, PATIENCE_S, picture
-from tests.core.lab import Lab, soon
+from tests.core.lab import Lab, held, soon
 
 BED = ROOT / "recordings/first-bed.mcap"
 GRAPH = """\
@@ -249,12 +249,6 @@ def test_of_a_camera_the_newest_frame_is_taken_of_a_recording_every_one(
 ) -> None:
     entered, release = threading.Event(), threading.Event()
 
-    class Slow(Stage):
-        def process(self, frame: RgbdFrame) -> RgbdFrame:
-            entered.set()
-            soon(release)
-            return frame
-
     class Sender(source_of(stream(tmp_path / "s.mcap", 9, live))):  # type: ignore[misc]
         def frames(self) -> Iterator[RgbdFrame]:
             for i, frame in enumerate(super().frames()):
@@ -266,7 +260,7 @@ def test_of_a_camera_the_newest_frame_is_taken_of_a_recording_every_one(
             release.set()
 
     lab.registry.source("stream", Sender)
-    report = lab.run(lab.chain(Slow, source="stream"))
+    report = lab.run(lab.chain(held(entered, release), source="stream"))
     assert report.error is None
     assert report.balanced()
     assert report.device == {"serial_number": "42"}

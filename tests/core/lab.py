@@ -103,6 +103,18 @@ class Fussy(Stage):
         return circles(1)
 
 
+def held(entered: threading.Event, release: threading.Event) -> type[Stage]:
+    """Return a stage that says when it has a frame, and keeps it until it is told."""
+
+    class Held(Stage):
+        def process(self, frame: RgbdFrame) -> RgbdFrame:
+            entered.set()
+            soon(release)
+            return frame
+
+    return Held
+
+
 class Lab:
     """A registry with the plugins above and a sink `collect`, and graphs run on them."""
 

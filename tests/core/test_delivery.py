@@ -6,7 +6,7 @@ from typing import ClassVar
 import pytest
 
 from mushpipe import Circles, RgbdFrame, Sink, Stage
-from tests.core.lab import Lab, make_frame, soon
+from tests.core.lab import Lab, held, make_frame, soon
 
 FULL = OSError("disk full")
 
@@ -21,14 +21,8 @@ def test_of_two_waiting_live_frames_the_newest_wins(lab: Lab):
         yield make_frame(2)
         release.set()
 
-    class Slow(Stage):
-        def process(self, frame: RgbdFrame) -> RgbdFrame:
-            entered.set()
-            soon(release)
-            return frame
-
     lab.live(frames)
-    report = lab.run(lab.chain(Slow, source="live"))
+    report = lab.run(lab.chain(held(entered, release), source="live"))
     assert [trace.frame.header.sequence for trace in lab.seen] == [0, 2]
     assert (report.frames_in, report.processed, report.dropped) == (3, 2, 1)
     assert report.balanced()

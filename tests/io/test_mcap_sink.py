@@ -130,6 +130,8 @@ def test_only_images_that_a_stage_made_are_recorded(tmp_path: Path) -> None:
     topics = set(by_topic(record(tmp_path / "all.mcap", [trace])))
     made = {"/mushpipe/bright/color", "/mushpipe/deep/depth"}
     assert topics == {COLOR, DEPTH, INFO, "/mushpipe/timing", *made}
+    given = record(tmp_path / "given.mcap", [trace], frames="source")
+    assert set(by_topic(given)) == topics - made
     few = record(tmp_path / "few.mcap", [trace], frames=False)
     assert set(by_topic(few)) == {"/mushpipe/timing"}
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from mushpipe import Camera, Picks, RgbdFrame, Stage
+from mushpipe import Camera, Picks
 from mushpipe.core.plugins import load_registry
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.recording import MANIFEST, RecordingReader
@@ -20,7 +20,7 @@ from mushpipe.core.wire import decode_table
 from mushpipe.sources.mcap import McapSource
 from mushpipe.sources.synthetic import SyntheticSource
 from tests.cli.test_commands import ROOT
-from tests.core.lab import Lab, soon
+from tests.core.lab import Lab, held, soon
 from tests.io import bags
 from tests.live.rig import SERIAL, SYSTEM, Rig, acquire
 
@@ -46,12 +46,6 @@ def test_of_a_camera_too_fast_for_the_graph_the_newest_frame_is_taken(lab: Lab):
     rig = Rig()
     entered, release = threading.Event(), threading.Event()
 
-    class Slow(Stage):
-        def process(self, frame: RgbdFrame) -> RgbdFrame:
-            entered.set()
-            soon(release)
-            return frame
-
     def camera() -> None:
         acquire(rig.started)
         for i in range(5):
@@ -62,7 +56,7 @@ def test_of_a_camera_too_fast_for_the_graph_the_newest_frame_is_taken(lab: Lab):
         release.set()
 
     lab.registry.source("camera", rig.source_class())
-    lab.registry.stage("slow", Slow)
+    lab.registry.stage("slow", held(entered, release))
     thread = threading.Thread(target=camera)
     thread.start()
     report = lab.run(graph(rig, "out: {use: collect}", "a: {use: slow}"), "source.max_frames=5")

@@ -30,8 +30,11 @@ def test_figures_of_a_small_graph(lab: Lab) -> None:
     result = bench(lambda count: lab.compile(text, f"source.count={count}"), 40)
     assert result["frames"] == 40
     assert list(result["nodes"]) == ["source", "a", "b", "out"]
-    for times in (*result["nodes"].values(), result["frame"]):
+    for times in (*result["nodes"].values(), result["frame"], result["latency"]):
         assert 0 <= times["p50_ms"] <= times["p95_ms"] <= times["p99_ms"] <= times["max_ms"]
+    assert (
+        result["latency"]["p50_ms"] >= result["frame"]["p50_ms"]
+    )  # it waits, and then is worked on
     assert result["allocated_mb_per_frame"] == pytest.approx(8, abs=0.2)
     assert result["peak_memory_mb"] > 8
     json.dumps(result)
