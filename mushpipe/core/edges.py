@@ -94,7 +94,8 @@ class SourceThread(threading.Thread):
         self.stop = stop
         self.durations = durations
         self.error: MushpipeError | None = None
-        self.box: Mailbox[RgbdFrame] = (
+        # frames, each with the time at which it left the source, ns of time.perf_counter_ns
+        self.box: Mailbox[tuple[RgbdFrame, int]] = (
             Mailbox(1, latest=True) if source.live else Mailbox(READ_AHEAD)
         )
 
@@ -115,7 +116,7 @@ class SourceThread(threading.Thread):
         timed_frames = timed(frames, self.durations)
         try:
             for frame in limited(paced(timed_frames, speed, self.stop), self.source):
-                if self.stop.is_set() or not self.box.put(frame):
+                if self.stop.is_set() or not self.box.put((frame, time.perf_counter_ns())):
                     break
         finally:
             if hasattr(frames, "close"):

@@ -64,7 +64,8 @@ class RunReport:
     ``read`` counts frames the source delivered, ``waiting`` those that were read ahead and never
     looked at because the run ended early. ``manifest`` says what the run was made of.
     ``durations`` holds what each node takes for a frame, source and sinks on threads of their own;
-    ``frame`` the sum of the stages.
+    ``frame`` the sum of the stages; ``latency`` the time from when a frame left the source until
+    what was found in it is handed to the sinks.
     """
 
     manifest: dict[str, Any] = field(default_factory=dict)
@@ -78,6 +79,7 @@ class RunReport:
     sinks: dict[str, SinkReport] = field(default_factory=dict)
     durations: dict[str, Durations] = field(default_factory=dict)
     frame: Durations = field(default_factory=Durations)
+    latency: Durations = field(default_factory=Durations)
     elapsed_s: float = 0.0
     interrupted: bool = False
     error: MushpipeError | None = None
@@ -119,6 +121,7 @@ class RunReport:
             "sinks": {name: vars(sink) for name, sink in self.sinks.items()},
             "durations": {name: d.summary() for name, d in self.durations.items() if d.count},
             **({"frame": self.frame.summary()} if self.frame.count else {}),
+            **({"latency": self.latency.summary()} if self.latency.count else {}),
             "elapsed_s": round(self.elapsed_s, 3),
             "capsules": self.capsules,
         }

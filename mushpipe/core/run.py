@@ -1,27 +1,23 @@
-"""Running a plan: one synchronous loop, frame by frame, whose balance must close."""
+"""Running a plan: frame by frame, in order, with a balance that must close."""
 
 from __future__ import annotations
 
 import logging
 import threading
 import time
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from mushpipe.core.capsule import write_capsule
+from mushpipe.core.chain import Chain, Passage, Turnstile, cores_shared, sink_inputs
 from mushpipe.core.edges import SinkThread, SourceThread, failure, interruptible_opening
 from mushpipe.core.errors import MushpipeError, StageError, UsageError
 from mushpipe.core.manifest import build_manifest
-from mushpipe.core.plan import Link, Node, Plan
+from mushpipe.core.plan import Node, Plan
 from mushpipe.core.report import Durations, RunReport
 from mushpipe.core.stage import Plugin, RunInfo, Sink, Source, Stage
-from mushpipe.core.types import Mask, RgbdFrame, Trace
+from mushpipe.core.types import RgbdFrame
 
 logger = logging.getLogger("mushpipe")
 Progress = Callable[[RunReport], None]
@@ -64,6 +60,13 @@ class _Runner:
         self.capsules = capsules
         nodes = (plan.source, *plan.stages, *plan.sinks)
         self.report = RunReport(durations={node.name: Durations() for node in nodes})
+        self.chain = Chain(plan)
+        self.entrance, self.exit = threading.Lock(), Turnstile()
+        self.taken = 0  # frames, and so the next ticket
+        self.over = False  # what is still on its way then is late
+        self.late = 0
+        self.failure: BaseException | None = None
+        self.failures_in_a_row = 0
         self.tolerance = 1
         self.started = time.monotonic()
         self.saved: set[str] = set()  # nodes with a failure capsule
@@ -85,6 +88,7 @@ class _Runner:
             for node in self.plan.sinks:
                 stack.enter_context(_opened(node, _opener(node, info)))
             threads = [self._sink_thread(node) for node in self.plan.sinks]
+            stack.enter_context(cores_shared())
             try:
                 self._loop(reader, threads)
             except StageError as error:
@@ -132,35 +136,85 @@ class _Runner:
         return SinkThread(node, self.plan.delivery(node) == "latest", self.tolerance, durations)
 
     def _loop(self, reader: SourceThread, threads: list[SinkThread]) -> None:
+        """Take frames through the stages on two threads, until there are no more or one fails."""
         for thread in (reader, *threads):
             thread.start()
-        failures_in_a_row = 0
-        while not reader.box.finished and not any(thread.error for thread in threads):
-            # Looked at after the loop again: an interrupted source may have ended by itself.
-            if self.stop.is_set():
-                break
-            frame = reader.box.get(timeout=0.1)
-            if frame is None:
-                continue
-            try:
-                trace = self._process(frame)
-            except StageError as error:
-                self.report.failed += 1
-                failures_in_a_row += 1
-                if failures_in_a_row >= self.tolerance:
-                    many = f" ({failures_in_a_row} frames in a row)" if self.tolerance > 1 else ""
-                    raise StageError(f"{error}{many}", error.exit_code) from error
-                logger.warning("%s; the frame is skipped", error)
-            else:
-                failures_in_a_row = 0
-                self.report.processed += 1
-                for thread in threads:
-                    thread.box.put((frame, _sink_inputs(thread.node, trace)))
-            self.report.read = reader.box.accepted
-            self.report.dropped = reader.box.dropped
-            if self.progress:
-                self.progress(self.report)
+        second = threading.Thread(
+            target=self._work, args=(reader, threads), name="mushpipe-stages", daemon=True
+        )
+        second.start()
+        self._work(reader, threads)
+        second.join()
         self.report.interrupted = self.stop.is_set()
+        if self.failure is not None:
+            raise self.failure
+
+    def _work(self, reader: SourceThread, threads: list[SinkThread]) -> None:
+        try:
+            while (taken := self._take(reader, threads)) is not None:
+                frame, left_ns, ticket = taken
+                passage = self.chain.passed(frame, ticket)
+                with self.exit.turn(ticket):
+                    self._deliver(passage, left_ns, reader, threads)
+        except BaseException as error:  # an interrupt, say: nobody may wait for this thread
+            self.failure = self.failure or error
+            self.over = True
+            self.chain.close()
+            self.exit.open()
+
+    def _at_end(self, threads: list[SinkThread]) -> bool:
+        return self.over or self.stop.is_set() or any(thread.error for thread in threads)
+
+    def _take(
+        self, reader: SourceThread, threads: list[SinkThread]
+    ) -> tuple[RgbdFrame, int, int] | None:
+        """Return the next frame, when it left the source, and its ticket; None at the end."""
+        with self.entrance:
+            # Only now: a frame that waits at the first stage would grow old there.
+            self.chain.await_first(self.taken)
+            while not (reader.box.finished or self._at_end(threads)):
+                if (item := reader.box.get(timeout=0.1)) is not None:
+                    self.taken += 1
+                    return *item, self.taken - 1
+        return None
+
+    def _deliver(
+        self, passage: Passage, left_ns: int, reader: SourceThread, threads: list[SinkThread]
+    ) -> None:
+        """Count a frame and hand it to the sinks; one that comes after the end only waited."""
+        if self.over:
+            self.late += 1
+            return
+        for name, duration in passage.durations_ns.items():
+            self.report.durations[name].add(duration)
+        if passage.failed is not None:
+            self._count_failure(passage.frame, *passage.failed)
+        else:
+            self.failures_in_a_row = 0
+            self.report.processed += 1
+            if passage.durations_ns:  # a recorder has no stages whose time could be told
+                self.report.frame.add(sum(passage.durations_ns.values()))
+            self.report.latency.add(time.perf_counter_ns() - left_ns)
+            trace = passage.trace()
+            for thread in threads:
+                thread.box.put((passage.frame, sink_inputs(thread.node, trace)))
+        self.report.read = reader.box.accepted
+        self.report.dropped = reader.box.dropped
+        if self.progress:
+            self.progress(self.report)
+        self.over = self._at_end(threads)
+
+    def _count_failure(self, frame: RgbdFrame, node: Node, error: Exception) -> None:
+        """Count a frame on which a stage failed; raise StageError where that ends the run."""
+        failed = failure(node, frame.header.sequence, error)
+        if not isinstance(error, MushpipeError):
+            self._save_capsule(node, frame, failed)
+        self.report.failed += 1
+        self.failures_in_a_row += 1
+        if self.failures_in_a_row >= self.tolerance:
+            many = f" ({self.failures_in_a_row} frames in a row)" if self.tolerance > 1 else ""
+            raise StageError(f"{failed}{many}", failed.exit_code) from error
+        logger.warning("%s; the frame is skipped", failed)
 
     def _wind_up(self, reader: SourceThread, source: Source, threads: list[SinkThread]) -> None:
         """Stop the threads, let the sinks finish what they were handed, and settle the counts."""
@@ -175,7 +229,7 @@ class _Runner:
                 edge.join(SOURCE_PATIENCE_S if edge is reader else None)
         self.report.read = reader.box.accepted
         self.report.dropped = reader.box.dropped
-        self.report.waiting = reader.box.waiting
+        self.report.waiting = reader.box.waiting + self.late
         self.report.elapsed_s = time.monotonic() - self.started
         self.report.source = source.counts()
         for thread in threads:
@@ -185,40 +239,6 @@ class _Runner:
                 if thread.failed_frame is not None:
                     self._save_capsule(thread.node, thread.failed_frame, thread.error)
         self.report.error = self.report.error or reader.error
-
-    def _process(self, frame: RgbdFrame) -> Trace:
-        seen = replace(frame, attached={})
-        outputs: dict[str, tuple[Any, ...]] = {self.plan.source.name: (seen,)}
-        durations: dict[str, int] = {}
-        for node in self.plan.stages:
-            begin = time.perf_counter_ns()
-            try:
-                outputs[node.name] = self._call(node, frame, outputs)
-            except Exception as error:
-                failed = failure(node, frame.header.sequence, error)
-                if not isinstance(error, MushpipeError):
-                    self._save_capsule(node, frame, failed)
-                raise failed from error
-            durations[node.name] = time.perf_counter_ns() - begin
-            self.report.durations[node.name].add(durations[node.name])
-        if durations:  # a recorder has no stages whose time could be told
-            self.report.frame.add(sum(durations.values()))
-        return Trace(frame, outputs, durations)
-
-    def _call(
-        self, node: Node, frame: RgbdFrame, outputs: dict[str, tuple[Any, ...]]
-    ) -> tuple[Any, ...]:
-        arguments = {name: _follow(link, outputs) for name, link in node.links.items()}
-        if node.ports.wants_rng:
-            name_key = zlib.crc32(node.name.encode())
-            arguments["rng"] = np.random.default_rng(
-                [self.plan.seed, name_key, frame.header.sequence]
-            )
-        result = node.plugin.process(**arguments)  # type: ignore[attr-defined]
-        values = result if isinstance(result, tuple) else (result,)
-        seen = [value for value in arguments.values() if isinstance(value, RgbdFrame)]
-        _check_outputs(node, values, seen[0] if seen else frame)
-        return values
 
     def _save_capsule(self, node: Node, frame: RgbdFrame, error: Exception) -> None:
         if self.capsules is None or node.name in self.saved:
@@ -262,31 +282,3 @@ def _opened(node: Node, opener: Callable[[], None]) -> Iterator[Plugin]:
         raise
     with _named(node):
         node.plugin.close()
-
-
-def _follow(link: Link, outputs: dict[str, tuple[Any, ...]]) -> Any:
-    return outputs[link.producer][link.output]
-
-
-def _sink_inputs(node: Node, trace: Trace) -> dict[str, Any]:
-    inputs = {name: _follow(link, dict(trace.outputs)) for name, link in node.links.items()}
-    for port in node.ports.inputs:
-        if port.type is Trace:
-            inputs[port.name] = trace
-    return inputs
-
-
-def _check_outputs(node: Node, values: tuple[Any, ...], frame: RgbdFrame) -> None:
-    """Raise TypeError or ValueError where outputs are not as declared, or do not fit the frame."""
-    expected = node.ports.outputs
-    matches = len(values) == len(expected) and all(map(isinstance, values, expected))
-    if not matches:
-        raise TypeError(
-            f"it returned ({', '.join(type(v).__name__ for v in values)}), "
-            f"declared is ({', '.join(t.__name__ for t in expected)})"
-        )
-    height, width = frame.color.shape[:2]
-    for value in values:
-        if isinstance(value, Mask) and value.foreground.shape != (height, width):
-            shape = value.foreground.shape
-            raise ValueError(f"its mask is {shape[1]}x{shape[0]}, the frame {width}x{height}")

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cache
 from typing import Any
 
+import foxglove.messages as fox
 import numpy as np
 from numpy.typing import NDArray
 
@@ -58,11 +60,14 @@ def drawings(value: Any, header: Header) -> Iterator[Message]:
         yield Message("/scene", foxglove_schema("SceneUpdate"), scene_update(value, header))
 
 
-def _color(rgb: Any, alpha: float = 1.0) -> Any:
-    from foxglove.messages import Color
+@cache
+def _color(rgb: tuple[int, int, int], alpha: float = 1.0) -> fox.Color:
+    r, g, b = rgb
+    return fox.Color(r=r / 255, g=g / 255, b=b / 255, a=alpha)
 
-    r, g, b = (float(value) / 255 for value in rgb)
-    return Color(r=r, g=g, b=b, a=alpha)
+
+def _colors(table: NDArray[np.uint8], alpha: float = 1.0) -> list[fox.Color]:
+    return [_color((r, g, b), alpha) for r, g, b in table.tolist()]
 
 
 def image_annotations(table: Circles | Picks, header: Header) -> bytes:
@@ -70,26 +75,23 @@ def image_annotations(table: Circles | Picks, header: Header) -> bytes:
 
     Foxglove counts pixels from the corner of the first one, mushpipe from its centre.
     """
-    from foxglove.messages import CircleAnnotation, ImageAnnotations, Point2, TextAnnotation
-
     picks = table if isinstance(table, Picks) else None
-    colors = [CYAN] * len(table) if picks is None else SOURCE_COLORS[picks.source]
-    places = [Point2(x=float(x) + 0.5, y=float(y) + 0.5) for x, y in table.center]
+    plain = [_color(CYAN)] * len(table)
+    colors = plain if picks is None else _colors(SOURCE_COLORS[picks.source])
+    places = [fox.Point2(x=x, y=y) for x, y in (table.center + 0.5).tolist()]
     circles = [
-        CircleAnnotation(
-            position=place, diameter=2 * float(radius), thickness=2, outline_color=_color(color)
-        )
-        for place, radius, color in zip(places, table.radius, colors, strict=True)
+        fox.CircleAnnotation(position=place, diameter=size, thickness=2, outline_color=color)
+        for place, size, color in zip(places, (2 * table.radius).tolist(), colors, strict=True)
     ]
     white, shade = _color((255, 255, 255)), _color((0, 0, 0), 0.5)
     texts = [
-        TextAnnotation(
+        fox.TextAnnotation(
             position=place, text=text, font_size=12, text_color=white, background_color=shade
         )
         for place, text in zip(places, [] if picks is None else labels(picks), strict=False)
     ]
-    message = ImageAnnotations(timestamp=timestamp(header.stamp_ns), circles=circles, texts=texts)
-    return bytes(message.encode())
+    stamp = timestamp(header.stamp_ns)
+    return fox.ImageAnnotations(timestamp=stamp, circles=circles, texts=texts).encode()
 
 
 def scene_update(picks: Picks, header: Header) -> bytes:
@@ -97,11 +99,9 @@ def scene_update(picks: Picks, header: Header) -> bytes:
 
     An entity replaces the one before it, so a frame without picks clears the scene.
     """
-    from foxglove.messages import SceneEntity, SceneUpdate
-
     rows = in_order(picks)
     caps = posed(picks, rows)
-    entity = SceneEntity(
+    entity = fox.SceneEntity(
         timestamp=timestamp(header.stamp_ns),
         frame_id=picks.frame_id or header.frame_id,
         id="picks",
@@ -109,72 +109,71 @@ def scene_update(picks: Picks, header: Header) -> bytes:
         arrows=_arrows(picks, caps),
         texts=_ranks(picks, rows),
     )
-    return bytes(SceneUpdate(entities=[entity]).encode())
+    return fox.SceneUpdate(entities=[entity]).encode()
 
 
-def _spheres(picks: Picks, rows: NDArray[np.intp]) -> list[Any]:
-    from foxglove.messages import SpherePrimitive, Vector3
-
+def _spheres(picks: Picks, rows: NDArray[np.intp]) -> list[fox.SpherePrimitive]:
     centers = picks.position[rows] - DOME / 2 * picks.diameter[rows, None] * picks.axis[rows]
     parts = zip(
-        centers, picks.quaternion[rows], picks.diameter[rows], tints(picks.sigma_tilt[rows]),
+        _poses(centers, picks.quaternion[rows]),
+        picks.diameter[rows].tolist(),
+        _colors(tints(picks.sigma_tilt[rows]), 0.4),
         strict=True,
-    )  # fmt: skip
+    )
     return [
-        SpherePrimitive(
-            pose=_pose(center, quaternion),
-            size=Vector3(x=float(d), y=float(d), z=float(DOME * d)),
-            color=_color(tint, 0.4),
-        )
-        for center, quaternion, d, tint in parts
+        fox.SpherePrimitive(pose=pose, size=fox.Vector3(x=d, y=d, z=DOME * d), color=color)
+        for pose, d, color in parts
     ]
 
 
-def _arrows(picks: Picks, rows: NDArray[np.intp]) -> list[Any]:
-    from foxglove.messages import ArrowPrimitive
+def _arrows(picks: Picks, rows: NDArray[np.intp]) -> list[fox.ArrowPrimitive]:
     from scipy.spatial.transform import Rotation
 
     if not len(rows):
         return []
     # An arrow points along +x of its pose, the axis of a cap along +z.
     turn = Rotation.from_euler("y", -90, degrees=True)
-    quaternions = (Rotation.from_quat(picks.quaternion[rows]) * turn).as_quat()
     parts = zip(
-        picks.position[rows], quaternions, picks.diameter[rows], tints(picks.sigma_tilt[rows]),
+        _poses(picks.position[rows], (Rotation.from_quat(picks.quaternion[rows]) * turn).as_quat()),
+        picks.diameter[rows].tolist(),
+        _colors(tints(picks.sigma_tilt[rows])),
         strict=True,
-    )  # fmt: skip
+    )
     return [
-        ArrowPrimitive(
-            pose=_pose(apex, quaternion),
-            shaft_length=0.35 * float(d),
+        fox.ArrowPrimitive(
+            pose=pose,
+            shaft_length=0.35 * d,
             shaft_diameter=0.002,
-            head_length=0.15 * float(d),
+            head_length=0.15 * d,
             head_diameter=0.004,
-            color=_color(tint),
+            color=color,
         )
-        for apex, quaternion, d, tint in parts
+        for pose, d, color in parts
     ]
 
 
-def _ranks(picks: Picks, rows: NDArray[np.intp]) -> list[Any]:
-    from foxglove.messages import TextPrimitive
-
-    upright = np.array([0.0, 0.0, 0.0, 1.0])
+def _ranks(picks: Picks, rows: NDArray[np.intp]) -> list[fox.TextPrimitive]:
+    upright = np.tile([0.0, 0.0, 0.0, 1.0], (len(rows), 1))
     return [
-        TextPrimitive(
-            pose=_pose(picks.position[row], upright),
+        fox.TextPrimitive(
+            pose=pose,
             billboard=True,
             font_size=12,
             scale_invariant=True,
             color=_color((255, 255, 255)),
-            text=str(rank + 1),
+            text=str(rank),
         )
-        for rank, row in enumerate(rows)
+        for rank, pose in enumerate(_poses(picks.position[rows], upright), start=1)
     ]
 
 
-def _pose(position: Any, quaternion: Any) -> Any:
-    from foxglove.messages import Pose, Quaternion, Vector3
-
-    (x, y, z), (qx, qy, qz, qw) = map(float, position), map(float, quaternion)
-    return Pose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+def _poses(positions: NDArray[np.float64], quaternions: NDArray[np.float64]) -> list[fox.Pose]:
+    return [
+        fox.Pose(
+            position=fox.Vector3(x=x, y=y, z=z),
+            orientation=fox.Quaternion(x=qx, y=qy, z=qz, w=qw),
+        )
+        for (x, y, z), (qx, qy, qz, qw) in zip(
+            positions.tolist(), quaternions.tolist(), strict=True
+        )
+    ]

@@ -74,7 +74,10 @@ class Plugin(BaseModel):
 
 
 class Stage(Plugin):
-    """One step of the pipeline; subclasses add ``process``, whose signature is their ports."""
+    """One step of the pipeline; subclasses add ``process``, whose signature is their ports.
+
+    It is called for all frames in order and one at a time, but not always from the same thread.
+    """
 
     def open(self) -> None:
         """Load weights, compile kernels: once per run, before the first frame."""

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import orjson
+from numpy.typing import NDArray
 
 from mushpipe.core import tables
 from mushpipe.core.geometry import Camera
@@ -106,19 +107,23 @@ def encode_color(frame: RgbdFrame, jpeg_quality: int | None = None) -> Message:
     if jpeg_quality is None:
         data = encode_image(frame.color, "rgb8", frame.header)
         return Message("", foxglove_schema("RawImage"), data)
-    import cv2
     from foxglove.messages import CompressedImage
 
-    _, buffer = cv2.imencode(
-        ".jpg", frame.color[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]
-    )
     image = CompressedImage(
         timestamp=timestamp(frame.header.stamp_ns),
         frame_id=frame.header.frame_id,
-        data=buffer.tobytes(),
+        data=jpeg(frame.color, jpeg_quality),
         format="jpeg",
     )
     return Message("", foxglove_schema("CompressedImage"), image.encode())
+
+
+def jpeg(color: NDArray[np.uint8], quality: int) -> bytes:
+    """Return an (H, W, 3) RGB image as JPEG of a quality from 1 to 100."""
+    import cv2
+
+    bgr = cv2.cvtColor(color, cv2.COLOR_RGB2BGR)
+    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
 def encode_depth(frame: RgbdFrame) -> Message:

@@ -60,6 +60,7 @@ class Painter:
         self._radius = np.array([m.radius for m in table])
         self._gloss = np.array([m.gloss for m in table], np.float32)
         self._plain = np.array([m.kind == Kind.PRINTED for m in table], bool)
+        self._grain = np.array([m.grain for m in table], np.float32)
         self._makers: dict[Material, Callable[[Surface, Ints], Singles]] = {
             Material.SOIL: self._ground,
             Material.TABLE: self._ground,
@@ -121,6 +122,7 @@ class Painter:
         q = surface.texture[rows]
         tone = 1 + 0.018 * self._at(surface, rows, 0.012) + 0.010 * self._at(surface, rows, 0.002)
         tone += 0.012 * self._fibres(surface, rows)
+        tone += self._grain[owner] * self._rings(surface, rows)
         color = (self._tint[owner] * tone[:, None]).astype(np.float32)
         bare = ~self._plain[owner]
         scales = self._scales(surface, rows) * self._scaly[owner]
@@ -131,6 +133,11 @@ class Painter:
         stain = smoothstep(1.3, 3.2, spread) * bare
         color = mix(color, (0.50, 0.37, 0.20), 0.5 * stain)
         return mix(color, _CRUMB, self._crumbs(surface, rows) * bare)
+
+    def _rings(self, surface: Surface, rows: Ints) -> Singles:
+        """Return growth rings (N,) of a cap turned from wood, cut obliquely."""
+        q = surface.texture[rows] + 0.004 * self._at(surface, rows, 0.02, 9)[:, None]
+        return np.asarray(np.sin(2 * np.pi * (q[:, 0] + 0.6 * q[:, 2]) / 0.004), np.float32)
 
     def _fibres(self, surface: Surface, rows: Ints) -> Singles:
         """Return streaks (N,) that run from the top of a cap to its rim."""

@@ -39,6 +39,7 @@ class Mushroom:
         scaly: 0..1, brown scales.
         dirt: 0..1, crumbs of soil on the cap.
         gloss: 0..1, how wet the skin is.
+        grain: 0..1, contrast of growth rings, of wood.
     """
 
     kind: Kind
@@ -53,6 +54,7 @@ class Mushroom:
     scaly: float = 0.0
     dirt: float = 0.3
     gloss: float = 0.1
+    grain: float = 0.0
 
     def rotation(self) -> Floats:
         """Return the rotation (3, 3) of the cap's own frame in the bed frame."""

@@ -16,6 +16,7 @@ _TINTS = {
     "white": (0.83, 0.80, 0.735),
     "cream": (0.74, 0.63, 0.44),
     "brown": (0.27, 0.178, 0.110),
+    "wood": (0.50, 0.39, 0.27),
 }
 _PRINTED = (0.80, 0.795, 0.765)
 _FLATNESS = 0.6  # a cap is about this much lower than wide; scales heights when caps collide
@@ -163,7 +164,7 @@ def _grow(
     height = float(seats.height[row])
     bend = min(0.75 * height, 0.9 * radius) if kind != Kind.FALLEN else 0.0
     spot = place - bend * axis[:2]
-    if settings.lean and kind == Kind.GROWING:
+    if settings.lean and kind in (Kind.GROWING, Kind.PRINTED):
         spot = spot - settings.lean * _lean(settings.seed, row, radius)
     foot = np.array([*spot, float(ground(spot[None])[0])])
     center = np.array([*place, foot[2] + height])
@@ -172,10 +173,13 @@ def _grow(
     name = settings.cap_color
     if name == "mixed":
         name = ("white", "cream", "brown")[rng.integers(3)]
-    tint = np.array(_PRINTED if kind == Kind.PRINTED else _TINTS[name])
-    tint = tint * rng.uniform(0.65 if name == "brown" else 0.9, 1.03) * rng.normal(1, 0.006, 3)
-    scaly = rng.uniform(0.4, 1.0) if name == "brown" else rng.choice([0.0, 0.15], p=[0.8, 0.2])
     printed = kind == Kind.PRINTED
+    tint = np.array(_PRINTED if printed and name != "wood" else _TINTS[name])
+    dark = {"brown": 0.65, "wood": 0.7}.get(name, 0.9)
+    tint = tint * rng.uniform(dark, 1.03) * rng.normal(1, 0.006, 3)
+    scaly = rng.uniform(0.4, 1.0) if name == "brown" else rng.choice([0.0, 0.15], p=[0.8, 0.2])
+    if name == "wood":
+        stem *= 1.5
     return Mushroom(
         kind,
         center,
@@ -189,6 +193,7 @@ def _grow(
         0.0 if printed else float(scaly),
         0.0 if printed else float(rng.beta(1.1, 2.5)),
         0.03 if printed else float(rng.uniform(0.02, 0.18)),
+        0.07 if name == "wood" else 0.0,
     )
 
 

@@ -35,8 +35,8 @@ class SceneSettings(BaseModel):
     shape_family: Literal["a", "b"] = Field(
         "a", description="a: superellipse domes; b: Bezier domes, conical to flat-topped"
     )
-    cap_color: Literal["white", "cream", "brown", "mixed"] = Field(
-        "white", description="colour of the caps"
+    cap_color: Literal["white", "cream", "brown", "mixed", "wood"] = Field(
+        "white", description="colour of the caps; wood: turned models with thick stems"
     )
     pins: int = Field(40, ge=0, le=300, description="mushrooms too small to pick, in view, about")
     stumps: int = Field(1, ge=0, le=40, description="stems left by a cut, in view, about")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,10 @@ from numpy.typing import NDArray
 from mushpipe import Camera, Circles, Header, Mask, PickFlag, Picks, RgbdFrame, Trace
 from mushpipe.core.scene import CYAN, DOME, GREEN, SOURCE_COLORS, in_order, labels, posed, tints
 from mushpipe.core.transform import Transform
+from mushpipe.core.wire import jpeg
 from mushpipe.sinks import rerun_layout as at
 
+_FEW = 4  # px between those that a statistic is taken of
 FIRST = 20  # picks whose place in the order is written beside them
 _WHEEL = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (213, 94, 0),
           (204, 121, 167), (150, 150, 255), (190, 190, 190))  # fmt: skip
@@ -51,7 +54,8 @@ def changed(trace: Trace) -> dict[str, RgbdFrame]:
 
 def distance_of(frame: RgbdFrame) -> float | None:
     """Return how far the bed is, m; None where there is no depth."""
-    known = frame.depth_m[np.isfinite(frame.depth_m)]
+    few = frame.depth_m[::_FEW, ::_FEW]
+    known = few[np.isfinite(few)]
     return float(np.median(known)) if known.size else None
 
 
@@ -121,8 +125,8 @@ def log_images(rec: Any, trace: Trace, jpeg_quality: int, cloud_step: int) -> No
     frame = trace.frame
     pictures = {at.COLOR: frame} | changed(trace)
     for order, (entity, picture) in enumerate(pictures.items()):
-        image = rr.Image(picture.color, draw_order=order).compress(jpeg_quality=jpeg_quality)
-        rec.log(entity, image)
+        data = jpeg(picture.color, jpeg_quality)
+        rec.log(entity, rr.EncodedImage(contents=data, media_type="image/jpeg", draw_order=order))
     for order, (entity, mask) in enumerate(masks(trace).items()):
         pixels = mask.view(np.uint8)
         rec.log(entity, rr.SegmentationImage(pixels, opacity=0.3, draw_order=10 + order))
@@ -146,7 +150,7 @@ def _log_depth(rec: Any, frame: RgbdFrame) -> None:
 
     depth = frame.depth_m
     missing = np.isnan(depth)
-    few = depth[::4, ::4]
+    few = depth[::_FEW, ::_FEW]
     known = few[np.isfinite(few)] / frame.depth_scale
     reach = np.percentile(known, (1, 99)) if known.size else None
     image = rr.DepthImage(
@@ -160,15 +164,23 @@ def _log_depth(rec: Any, frame: RgbdFrame) -> None:
 def _log_cloud(rec: Any, frame: RgbdFrame, camera: Camera, step: int) -> None:
     import rerun as rr
 
+    rays = _rays(camera, step)
+    depth = frame.depth_m[::step, ::step].reshape(-1, 1)
+    known = np.flatnonzero((depth > 0) & (rays[:, 2:] > 0))
+    points = rays[known] * depth[known]
+    colors = frame.color[::step, ::step].reshape(-1, 3)[known]
+    radii = 0.6 * step * float(np.median(points[::_FEW, 2])) / camera.fx if len(known) else None
+    rec.log(at.CLOUD, rr.Points3D(points, colors=colors, radii=radii))
+
+
+@lru_cache(maxsize=4)
+def _rays(camera: Camera, step: int) -> NDArray[np.float32]:
+    """Return the rays (N, 3) of every ``step``-th pixel each way; z is 1, or 0 without a ray."""
     from mushpipe.stages.upright import pixel_rays
 
-    every = np.s_[::step, ::step]
-    depth, rays = frame.depth_m[every], pixel_rays(camera)[every]
-    known = np.isfinite(depth) & (np.abs(rays) < 1e3).all(axis=2)
-    z = depth[known][:, None]
-    points = np.hstack([rays[known] * z, z])
-    radii = 0.6 * step * float(np.median(z)) / camera.fx if len(z) else None
-    rec.log(at.CLOUD, rr.Points3D(points, colors=frame.color[every][known], radii=radii))
+    xy = pixel_rays(camera)[::step, ::step].reshape(-1, 2)
+    z = (np.abs(xy) < 1e3).all(axis=1, keepdims=True)
+    return np.hstack([xy, z], dtype=np.float32)
 
 
 def log_results(rec: Any, trace: Trace, base: Transform | None) -> None:

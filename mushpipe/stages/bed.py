@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
-from mushpipe.stages.linear import least_squares
+from mushpipe.stages.linear import normal_equations, solve
 
 Floats = NDArray[np.float64]
 Plane = NDArray[np.float32]
@@ -104,16 +104,33 @@ def fit_plane(points: Floats) -> Floats | None:
         return None
     scale = max(float(np.abs([x, y]).max()), 1e-6)
     basis = np.column_stack([np.ones(len(z)), x / scale, y / scale])
-    weight, solution = np.ones(len(z)), np.zeros(3)
+    return np.asarray(_biweight(basis, z) / [1, scale, scale])
+
+
+@jit
+def _biweight(basis: Floats, z: Floats) -> Floats:
+    """Solve 1 / z = basis x by reweighting, from weights of 1."""
+    inverse, misfit, weight = 1 / z, np.empty(len(z)), np.ones(len(z))
+    solution = np.zeros(basis.shape[1])
     for _ in range(20):
-        before, solution = solution, least_squares(basis, 1 / z, weight)
-        if np.abs(solution - before).max() < 1e-4:  # 1/m
+        normal, right = normal_equations(basis, inverse, weight)
+        for i in range(len(right)):
+            normal[i, i] *= 1 + 1e-12  # points on one line determine no plane
+        solve(normal, right)
+        moved = np.abs(right - solution).max()
+        solution = right
+        if moved < 1e-4:  # 1/m
             break
-        above = 1 / np.maximum(basis @ solution, 1e-3) - z
-        scaled = above / np.where(above > 0, RISE_M, FALL_M)
-        spread = max(1.0, 1.5 * float(np.median(np.abs(scaled))))  # wide while most does not fit
-        weight = np.maximum(0, 1 - (scaled / spread) ** 2) ** 2 + 1e-6
-    return solution / [1, scale, scale]
+        for m in range(len(z)):
+            model = 0.0
+            for i in range(len(solution)):
+                model += basis[m, i] * solution[i]
+            above = 1 / max(model, 1e-3) - z[m]
+            misfit[m] = above / RISE_M if above > 0 else -above / FALL_M
+        spread = max(1.0, 1.5 * np.median(misfit))  # wide while most does not fit
+        for m in range(len(z)):
+            weight[m] = max(0.0, 1 - (misfit[m] / spread) ** 2) ** 2 + 1e-6
+    return solution
 
 
 def plane_depth(coefficients: Floats, x: Floats, y: Floats) -> Floats:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe import RgbdFrame
-from mushpipe.stages.evidence import BELIEVED, believed_foreground
+from mushpipe.stages.evidence import BELIEVED, believed_foreground, halved
 
 Channel = Literal["gray", "rgb", "a", "red-blue", "auto", "gray+height"]
 MANY = ("rgb", "gray+height")  # channels of more than one plane
@@ -33,7 +33,11 @@ def channel_image(frame: RgbdFrame, channel: Channel) -> Plane:
         return np.asarray(frame.color * np.float32(1 / 255), np.float32)
     if channel == "gray+height":
         return _with_height(frame)
-    color = cv2.GaussianBlur(frame.color, (5, 5), 1.0)
+    return _stretched(cv2.GaussianBlur(frame.color, (5, 5), 1.0), channel)
+
+
+def _stretched(color: Any, channel: str) -> Plane:
+    """Return the channel ``a`` or ``red-blue`` of a blurred image, (H, W) from 0 to 1."""
     if channel == "a":
         plane = cv2.extractChannel(cv2.cvtColor(color, cv2.COLOR_RGB2LAB), 1).astype(np.float32)
     else:
@@ -60,16 +64,23 @@ def best_image(frame: RgbdFrame) -> Plane:
     """
     gray = channel_image(frame, "gray")
     bright, known, _ = believed_foreground(gray)
-    best, chosen = known, (gray, bright)
-    for name in ("a", "red-blue"):
-        image = channel_image(frame, name)
-        region, found, _ = believed_foreground(image)
-        if found > max(best, 1.25 * BELIEVED) and _agrees(region, bright) > 0.3:
-            best, chosen = found, (image, region)
-    image, region = chosen
-    if image is gray or _agrees(region, bright) > 0.7:
+    small = halved(bright).view(np.bool_)
+    candidates: tuple[Channel, ...] = ("a", "red-blue")
+    best, chosen, region = known, None, small
+    # Of the colours a level of the Gaussian pyramid (Burt & Adelson 1983) will do: in full
+    # resolution they are blurred as much.
+    color = cv2.pyrDown(frame.color, dstsize=(small.shape[1], small.shape[0]))
+    for candidate in candidates:
+        found = believed_foreground(_stretched(color, candidate), half=True)
+        if found.strength > max(best, 1.25 * BELIEVED) and _agrees(found.region, small) > 0.3:
+            best, chosen, region = found.strength, candidate, found.region
+    if chosen is None:
+        return gray
+    image = channel_image(frame, chosen)
+    if _agrees(region, small) > 0.7:
         return image
-    return np.maximum(_membership(gray, bright), _membership(image, region))
+    whole = cv2.resize(region.view(np.uint8), gray.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    return np.maximum(_membership(gray, bright), _membership(image, whole.view(np.bool_)))
 
 
 def _agrees(region: Region, bright: Region) -> float:

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 
 from mushpipe import GraphPath, InputError, RgbdFrame, Stage
 from mushpipe.core.document import read_document
 from mushpipe.core.errors import GraphError
+from mushpipe.core.jit import jit
+from mushpipe.stages.warm_up import example_frame
+
+Plane = NDArray[np.float32]
 
 
 class DepthCorrect(Stage):
@@ -41,28 +47,45 @@ class DepthCorrect(Stage):
         self._errors = (self.offset_mm, self.slope_mm_per_m, self.curve_mm_per_m2)
 
     def open(self) -> None:
-        """Read the calibration.
+        """Read the calibration, and compile the kernel for both forms of depth.
 
         Raises:
             InputError: The file is missing or no such calibration.
         """
-        if self.calibration is None:
-            return
+        if self.calibration is not None:
+            self._errors = self._read(self.calibration)
+        for native in (np.uint16, np.float32):
+            frame = example_frame()
+            self.process(replace(frame, depth=frame.depth_m.astype(native)))
+
+    def _read(self, path: Path) -> tuple[float, float, float]:
         try:
-            found = DepthCorrect.model_validate(read_document(self.calibration).data)
+            found = DepthCorrect.model_validate(read_document(path).data)
             if found.calibration is not None:
                 raise ValueError("it names another file")
         except (GraphError, ValueError) as error:
-            raise InputError(f"{self.calibration}: no calibration of depth: {error}") from error
-        self._errors = found._errors
+            raise InputError(f"{path}: no calibration of depth: {error}") from error
+        return found._errors
 
     def process(self, frame: RgbdFrame) -> RgbdFrame:
         """Return the frame with corrected depth, float32 in the sensor's unit, 0 = missing."""
         if frame.depth is None:
             return frame
-        z = np.fmax(frame.depth_m, np.float32(0))
-        offset, slope, curve = (np.float32(k / 1000) for k in self._errors)
-        error = offset + z * (slope + z * curve) if slope or curve else offset
-        unit = np.float32(1 / frame.depth_scale)
-        corrected = np.where(z > 0, np.maximum(z - error, 0), np.float32(0)) * unit
-        return replace(frame, depth=corrected.astype(np.float32))
+        errors = np.array(self._errors, np.float32) / np.float32(1000)
+        return replace(frame, depth=corrected(frame.depth, frame.depth_scale, errors))
+
+
+@jit
+def corrected(depth: NDArray[Any], scale: float, errors: NDArray[np.float32]) -> Plane:
+    """Take a polynomial with coefficients from the constant on (m) off depth in units of scale (m).
+
+    What is missing, or not above 0 afterwards, is 0.
+    """
+    out = np.empty(depth.shape, np.float32)
+    unit, per_m = np.float32(scale), np.float32(1 / scale)
+    for y in range(depth.shape[0]):
+        for x in range(depth.shape[1]):
+            z = np.float32(depth[y, x]) * unit
+            left = z - (errors[0] + z * (errors[1] + z * errors[2]))
+            out[y, x] = left * per_m if z > 0 and 0 < left < np.inf else np.float32(0)
+    return out

@@ -47,14 +47,19 @@ class Evidence(NamedTuple):
     floor: float
 
 
-def believed_foreground(image: Plane) -> Evidence:
-    """Return the first believed split of an (H, W) image in 0..1."""
+def believed_foreground(image: Plane, half: bool = False) -> Evidence:
+    """Return the first believed split of an (H, W) image in 0..1.
+
+    Args:
+        image: The image.
+        half: It stands at half resolution, in which compactness and step are judged.
+    """
     levels = cv2.convertScaleAbs(image, alpha=255)
     histogram = cv2.calcHist([levels], [0], None, [256], [0, 256]).ravel().astype(np.float64)
     start = 0
     for level in splits(histogram):
         region = np.asarray(levels > level)
-        small = halved(region)
+        small = region.view(np.uint8) if half else halved(region)
         strength = contrast(histogram, level) * compactness(small) ** 0.5
         if strength >= BELIEVED and edge_step(levels, small) >= STEP:
             return Evidence(region, strength, _mean(histogram, start, level) if start else 0.0)

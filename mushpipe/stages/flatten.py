@@ -8,6 +8,7 @@ are part of the fit because dividing by a local mean would take dense caps for l
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -16,10 +17,11 @@ from pydantic import Field
 
 from mushpipe import RgbdFrame, Stage
 from mushpipe.core.jit import jit
-from mushpipe.stages.linear import least_squares
+from mushpipe.stages.linear import normal_equations, solve
 from mushpipe.stages.otsu import otsu_foreground
 from mushpipe.stages.warm_up import example_frame
 
+Floats = NDArray[np.float64]
 Plane = NDArray[np.float32]
 _DARK = 2.0  # keeps the logarithm of black finite, on 0..255
 # Noise in the logarithm goes with the inverse of brightness: what is darker than this counts
@@ -59,24 +61,51 @@ def light_field(gray: Plane, iterations: int) -> Plane:
     if high - low < 1e-6:
         return np.zeros(gray.shape, np.float32)
     u = otsu_foreground((detail - low) / (high - low)).ravel()
-    field, weight = np.zeros(h.size), np.asarray(gray / (gray + _DIM), np.float64).ravel() + 1e-3
-    for _ in range(iterations):
-        if u.all() or not u.any():
-            break
-        columns = np.column_stack([u, ~u, basis]).astype(np.float64)
-        solution = least_squares(columns, h.ravel(), weight)
-        field = np.einsum("mk,k->m", basis, solution[2:])
-        new = h.ravel() - field > solution[:2].mean()
-        if np.array_equal(new, u):
-            break
-        u = new
+    weight = np.asarray(gray / (gray + _DIM), np.float64).ravel() + 1e-3
+    field = _fit(h.ravel().astype(np.float64), weight, basis, u.copy(), iterations)
     return np.asarray((field - field.mean()).reshape(gray.shape), np.float32)
 
 
-def _quadratic(height: int, width: int) -> NDArray[np.float64]:
+@lru_cache(maxsize=4)
+def _quadratic(height: int, width: int) -> Floats:
     """Return (H W, 5): x, y, x^2, xy, y^2 on -1..1."""
     y, x = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
     return np.column_stack([t.ravel() for t in (x, y, x * x, x * y, y * y)])
+
+
+@jit
+def _fit(h: Floats, weight: Floats, basis: Floats, u: NDArray[np.bool_], rounds: int) -> Floats:
+    """Fit h = level of the class + basis k, and assign the classes u anew, round by round.
+
+    Returns the light field basis k (M,); u is changed.
+    """
+    field = np.zeros(len(h))
+    fixed, fixed_right = normal_equations(basis, h, weight)
+    for _ in range(rounds):
+        inside = np.count_nonzero(u)
+        if inside in (0, len(u)):
+            break
+        normal, right = np.zeros((7, 7)), np.zeros(7)
+        normal[2:, 2:], right[2:] = fixed, fixed_right
+        for m in range(len(h)):
+            row = 0 if u[m] else 1
+            normal[row, row] += weight[m]
+            right[row] += weight[m] * h[m]
+            for k in range(5):
+                normal[row, 2 + k] += weight[m] * basis[m, k]
+        normal[2:, :2] = normal[:2, 2:].T
+        solve(normal, right)
+        middle, moved = (right[0] + right[1]) / 2, False
+        for m in range(len(h)):
+            light = 0.0
+            for k in range(5):
+                light += basis[m, k] * right[2 + k]
+            bright = h[m] - light > middle
+            moved = moved or bright != u[m]
+            field[m], u[m] = light, bright
+        if not moved:
+            break
+    return field
 
 
 @jit

@@ -27,14 +27,15 @@ def least_squares(columns: Floats, target: Floats, weight: Floats | None = None)
     """
     share = np.ones(len(target)) if weight is None else weight
     # copies: of one type whatever is given, so that the kernel is compiled once
-    normal, right = _normal_equations(
+    normal, right = normal_equations(
         *(np.array(part, np.float64, order="C") for part in (columns, target, share))
     )
     return np.asarray(np.linalg.lstsq(normal, right)[0])
 
 
 @jit
-def _normal_equations(columns: Floats, target: Floats, weight: Floats) -> tuple[Floats, Floats]:
+def normal_equations(columns: Floats, target: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    """Return the matrix (K, K) and the right side (K,) of `least_squares`."""
     size = columns.shape[1]
     normal, right = np.zeros((size, size)), np.zeros(size)
     for m in range(len(target)):

@@ -164,40 +164,82 @@ def decide(
     """
     n = len(shapes)
     owner = np.full(len(edges.x), -1, np.int32)
-    chance, waiting = np.ones(n), np.ones(n, np.bool_)
-    accepted, order = np.empty((n, 5)), np.empty(n, np.int32)
-    rows = np.empty(4096, np.int32)
-    count = 0
-    while True:
+    chance, waiting = np.empty(n), np.ones(n, np.bool_)
+    order, rows = np.empty(n, np.int32), np.empty(4096, np.int32)
+    first, beside = neighbours(shapes)
+    near = np.empty((n, 5))
+    for k in range(n):
+        outline_features(edges, shapes[k], hits[k], owner, near[:0], table[k])
+        overlap_features(shapes[k], near[:0], table[k])
+        chance[k] = probability(table[k], depth_weights if depth[k] else image_weights)
+    for count in range(n):
         best, top = -1, least
         for k in range(n):
-            # Not only what it used up: what it hides, too, changes the odds of its neighbours.
-            alive = waiting[k] and chance[k] > HOPELESS
-            if alive and (count == 0 or _meet(shapes[k], accepted[count - 1])):
-                near = _neighbours(shapes[k], accepted[:count])
-                outline_features(edges, shapes[k], hits[k], owner, near, table[k])
-                overlap_features(shapes[k], near, table[k])
-                chance[k] = probability(table[k], depth_weights if depth[k] else image_weights)
             if waiting[k] and chance[k] >= top:
                 best, top = k, chance[k]
         if best < 0:
-            break
-        waiting[best] = False
-        accepted[count], order[count] = shapes[best], best
+            return order[:count], chance, owner
+        waiting[best], order[count] = False, best
         _use_up(edges, shapes[best], count, owner, rows)
-        count += 1
-    return order[:count], chance, owner
+        # Not only what it used up: what it hides, too, changes the odds of its neighbours.
+        for k in beside[first[best] : first[best + 1]]:
+            if waiting[k] and chance[k] > HOPELESS:
+                met = _accepted(shapes, waiting, beside[first[k] : first[k + 1]], near)
+                outline_features(edges, shapes[k], hits[k], owner, near[:met], table[k])
+                overlap_features(shapes[k], near[:met], table[k])
+                chance[k] = probability(table[k], depth_weights if depth[k] else image_weights)
+    return order, chance, owner
 
 
 @jit
-def _meet(one: Shape, other: Shape) -> bool:
-    """Whether two outlines are so near that accepting one may change what is known of the other."""
-    reach = one[2] + other[2] + 4
-    return bool((one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2 < reach * reach)
+def neighbours(shapes: Table) -> tuple[Rows, Rows]:
+    """Return the outlines so near each outline (N, 5) that accepting one may change the other.
+
+    Returns:
+        (N + 1,) and (M,): those of outline k are `beside[first[k] : first[k + 1]]`.
+    """
+    n = len(shapes)
+    first, beside = np.zeros(n + 1, np.int32), np.empty(0, np.int32)
+    by_x = np.argsort(shapes[:, 0])
+    largest = shapes[:, 2].max() if n else 0.0
+    for turn in range(2):  # count, then fill
+        if turn == 1:
+            first[1:] = np.cumsum(first[1:])
+            beside = np.empty(first[n], np.int32)
+            at = first.copy()
+        for i in range(n):
+            one = by_x[i]
+            for j in range(i + 1, n):
+                other = by_x[j]
+                across = shapes[other, 0] - shapes[one, 0]
+                if across > shapes[one, 2] + largest + 4:
+                    break
+                reach = shapes[one, 2] + shapes[other, 2] + 4
+                if across**2 + (shapes[other, 1] - shapes[one, 1]) ** 2 >= reach * reach:
+                    continue
+                if turn == 0:
+                    first[one + 1] += 1
+                    first[other + 1] += 1
+                else:
+                    beside[at[one]], beside[at[other]] = other, one
+                    at[one] += 1
+                    at[other] += 1
+    return first, beside
 
 
 @jit
-def _neighbours(shape: Shape, accepted: Table) -> Table:
+def _accepted(shapes: Table, waiting: NDArray[np.bool_], beside: Rows, near: Table) -> int:
+    """Write the accepted of some outlines to the first rows of `near`; return how many."""
+    count = 0
+    for k in beside:
+        if not waiting[k]:
+            near[count] = shapes[k]
+            count += 1
+    return count
+
+
+@jit
+def _met(shape: Shape, accepted: Table) -> Table:
     """Return the accepted outlines whose circle meets the circle of a shape."""
     found = np.empty_like(accepted)
     count = 0
@@ -220,7 +262,7 @@ def polish(edges: Edges, height: Plane, pixel: float, outlines: Table, owner: Ro
     shape = np.empty(5)
     for k in range(len(outlines)):
         shape[:] = outlines[k]
-        near = _neighbours(shape, outlines[:k])
+        near = _met(shape, outlines[:k])
         count = gather(edges, height, step_up(shape[2] * pixel), shape, NARROW, 1, rows)
         kept = 0
         for m in range(count):

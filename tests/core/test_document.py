@@ -1,6 +1,7 @@
 """Reading YAML: places of keys and values, and everything that is refused."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -206,13 +207,15 @@ def test_a_document_that_is_no_text_has_no_places():
     assert str(Document("a capsule", HERE).problem(("a",), "x")) == "a capsule: x"
 
 
-scalars = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text()
+# 0E0 is a number here, as in YAML 1.2, and a string to PyYAML, which writes it without quotes.
+texts = st.text().filter(lambda text: not re.fullmatch(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+", text))
+scalars = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | texts
 trees = st.recursive(
-    scalars, lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner), max_leaves=8
+    scalars, lambda inner: st.lists(inner) | st.dictionaries(texts, inner), max_leaves=8
 )
 
 
-@given(st.dictionaries(st.text(), trees))
+@given(st.dictionaries(texts, trees))
 def test_what_json_can_say_survives_yaml(data):
     # JSON strings with escapes are YAML: an independent writer of the same data.
     data = json.loads(json.dumps(data))

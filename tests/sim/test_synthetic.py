@@ -119,6 +119,17 @@ def test_printed_mushrooms_stand_on_every_table(table):
     assert (truth.diameter > 0.033).all()
 
 
+def test_models_of_wood_are_brown_and_striped():
+    lab = {"scene": "lab", "count": 8, "size_mm": (40, 50), "clutter": 0, "distance": 0.3}
+
+    def caps(**settings: str) -> np.ndarray:
+        frame = frames(**lab, **settings)[0]
+        return frame.color[frame.attached[INSTANCES_TOPIC].labels > 0].astype(float)
+
+    wood, plastic = caps(cap_color="wood"), caps()
+    assert (wood[:, 0] - wood[:, 2]).mean() > (plastic[:, 0] - plastic[:, 2]).mean() + 20
+
+
 def test_a_bed_with_everything_on_it():
     frame = frames(tray=True, stumps=4, fallen=4, cap_color="mixed", tilt_deg=(20, 45))[0]
     truth = frame.attached[TRUTH_TOPIC]

@@ -7,7 +7,7 @@ import pytest
 
 from mushpipe.core.truth import Ignore
 from mushpipe.stages.cap_decode import HEAT, MASK, circles_of
-from training.net.augment import aims, crop
+from training.net.augment import aims, blackened, crop
 from training.net.scenes import Picture, settings
 
 DISCS = [(150.0, 120.0, 30.0), (300.5, 200.25, 18.0), (420.0, 330.0, 41.0)]
@@ -52,6 +52,19 @@ def test_a_stump_is_no_cap_and_a_hidden_cap_is_not_asked_for() -> None:
     hidden = [crop(picture(visible=0.1), 224, np.random.default_rng(k)) for k in range(4)]
     assert not any((target[HEAT] > 0).any() for _, target, _ in hidden)
     assert any((weight == 0).any() for _, _, weight in hidden)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_raised_black_point_leaves_caps_brighter_than_the_soil(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    image = rng.uniform(0.05, 0.2, (40, 40, 3)).astype(np.float32)
+    cap = np.zeros((40, 40), np.float32)
+    cap[10:30, 10:30] = 1
+    image[cap > 0] += np.float32(0.4)
+    dark = blackened(image, cap, rng)
+    assert dark.min() >= 0
+    assert dark[cap == 0].mean() < image[cap == 0].mean()
+    assert dark[cap > 0].mean() > 5 * dark[cap == 0].mean()
 
 
 def test_drawn_settings_are_ones_the_simulator_takes_and_of_family_a() -> None:

@@ -36,7 +36,7 @@ def _placement(
     picture: Picture, size: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.float64], float]:
     """Draw an affine map (2, 3) of the frame onto the crop, and its scale."""
-    scale = float(np.exp(rng.uniform(np.log(0.55), np.log(1.8))))
+    scale = float(np.exp(rng.uniform(np.log(0.5), np.log(2.2))))
     turn = rng.uniform(-np.pi, np.pi)
     c, s = scale * np.cos(turn), scale * np.sin(turn)
     linear = np.array([[c, -s], [s, c]]) * rng.choice([-1, 1], (1, 1))
@@ -84,6 +84,8 @@ def photographed(image: Singles, cap: Singles, rng: np.random.Generator) -> Sing
     if rng.random() < 0.4:  # other caps on the same bed
         gain = np.exp(rng.uniform(-0.8, 0.3) + rng.normal(0, 0.12, 3)).astype(np.float32)
         image = image * (1 + cap[..., None] * (gain - 1))
+    if rng.random() < 0.3:  # gaps between caps are black in contrasty pictures
+        image = blackened(image, cap, rng)
     image = image * np.exp(rng.normal(0, 0.08, 3)).astype(np.float32)
     gray = image.mean(axis=2, keepdims=True)
     image = gray + (image - gray) * np.float32(rng.uniform(0.2, 1.6))
@@ -98,6 +100,14 @@ def photographed(image: Singles, cap: Singles, rng: np.random.Generator) -> Sing
         rng.exponential(0.015)
     )
     return np.asarray(np.clip(image, 0, 1), np.float32)
+
+
+def blackened(image: Singles, cap: Singles, rng: np.random.Generator) -> Singles:
+    """Raise the black point towards the darkest parts of the caps."""
+    inside = image[cap > 0.9]
+    darkest = float(np.quantile(inside.mean(axis=1), 0.05)) if len(inside) else 0.2
+    black = np.float32(min(0.9, rng.uniform(0.2, 1) * darkest))
+    return np.maximum(image - black, 0) / (1 - black)
 
 
 def _light(size: int, rng: np.random.Generator) -> Singles:

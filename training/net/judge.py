@@ -40,10 +40,10 @@ def simulated(models: list[Path], cache: Path, peers: bool) -> str:
         for name, net in nets.items():
             scores[case.condition, name].add(net.process(case.frame)[1], case.truth, counts)
         if peers:
-            frame, mask = segmentations(case.frame)[0]
-            learned = NET.process(case.frame)[1]
+            seen = {False: (*segmentations(case.frame)[0], None)}
+            seen[True] = (case.frame, *NET.process(case.frame))
             for name, stage in CLASSIC.items():
-                circles = stage.process(frame, mask, learned)
+                circles = stage.process(*seen[stage.use_learned])
                 scores[case.condition, name].add(circles, case.truth, counts)
     return judge.table(scores, [*nets, *(CLASSIC if peers else ())])
 

@@ -55,8 +55,8 @@ def settings(seed: int) -> dict[str, Any]:
 
     distance, small, tilt = log(0.28, 0.85), rng.uniform(10, 30), rng.uniform(0, 15)
     count = 0 if rng.random() < 0.05 else log(6, 120) * (distance / 0.5) ** 2
-    lab = rng.random() < 0.2
-    return {
+    lab = rng.random() < 0.25
+    drawn = {
         "seed": seed,
         "max_frames": 1,
         "scene": "lab" if lab else "bed",
@@ -65,7 +65,7 @@ def settings(seed: int) -> dict[str, Any]:
         "clutter": int(rng.integers(0, 13)),
         "distance": distance,
         "camera_tilt_deg": some(0.5, 20),
-        "count": round(min(count * (0.2 if lab else 1), 200)),
+        "count": round(min(count * (0.4 if lab else 1), 200)),
         "cluster": float(rng.random()),
         "size_mm": (small, small + rng.uniform(5, 45)),
         "tilt_deg": (tilt, tilt + rng.uniform(5, 30)),
@@ -93,6 +93,10 @@ def settings(seed: int) -> dict[str, Any]:
             "jpeg_quality": int(rng.choice([0, 60, 80, 92])),
         },
     }
+    if lab and rng.random() < 0.5:  # models turned from wood
+        drawn |= {"cap_color": "wood", "printed": True, "table": "wood"}
+        drawn |= {"count": int(rng.integers(3, 25)), "size_mm": (small + 10, small + 50)}
+    return drawn
 
 
 def picture(seed: int, cache: Path) -> Picture:

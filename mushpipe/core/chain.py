@@ -1,0 +1,168 @@
+"""The stages of a plan, through which frames follow one another.
+
+A frame may enter a stage as soon as the frame before it has left that stage: every stage sees all
+frames, in order and one at a time, so what comes out is what a single thread would have made.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from mushpipe.core.plan import Link, Node, Plan
+from mushpipe.core.types import Mask, RgbdFrame, Trace
+
+Outputs = dict[str, tuple[Any, ...]]
+
+
+class Turnstile:
+    """Lets the holders of tickets 0, 1, 2 and so on in, one at a time and in that order."""
+
+    def __init__(self) -> None:
+        self._next = 0
+        self._open = False
+        self._changed = threading.Condition()
+
+    def wait(self, ticket: int) -> None:
+        """Wait for the turn of a ticket."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._next == ticket or self._open)
+
+    @contextmanager
+    def turn(self, ticket: int) -> Iterator[None]:
+        """Wait for the turn of a ticket, and end it on leaving."""
+        self.wait(ticket)
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._next += 1
+                self._changed.notify_all()
+
+    def open(self) -> None:
+        """Let everybody through: the holder of a ticket will not come any more."""
+        with self._changed:
+            self._open = True
+            self._changed.notify_all()
+
+
+@dataclass
+class Passage:
+    """What became of a frame on its way: ``failed`` is the stage that raised, with its error."""
+
+    frame: RgbdFrame
+    outputs: Outputs
+    durations_ns: dict[str, int] = field(default_factory=dict)
+    failed: tuple[Node, Exception] | None = None
+
+    def trace(self) -> Trace:
+        """Return what the sinks get."""
+        return Trace(self.frame, self.outputs, self.durations_ns)
+
+
+class Chain:
+    """The stages of a plan; several threads may bring frames, each with a ticket of its own."""
+
+    def __init__(self, plan: Plan) -> None:
+        self.plan = plan
+        self.closed = False
+        self._turnstiles = [Turnstile() for _ in plan.stages]
+
+    def await_first(self, ticket: int) -> None:
+        """Wait until the first stage is free for a ticket."""
+        for turnstile in self._turnstiles[:1]:
+            turnstile.wait(ticket)
+
+    def passed(self, frame: RgbdFrame, ticket: int) -> Passage:
+        """Take a frame through the stages, up to the one that fails, and return what they did."""
+        seen = replace(frame, attached={})
+        passage = Passage(frame, {self.plan.source.name: (seen,)})
+        for node, turnstile in zip(self.plan.stages, self._turnstiles, strict=True):
+            with turnstile.turn(ticket):
+                if passage.failed is None and not self.closed:
+                    self._step(node, passage)
+        return passage
+
+    def close(self) -> None:
+        """Let what is on its way pass without calling stages: nobody will look at it."""
+        self.closed = True
+        for turnstile in self._turnstiles:
+            turnstile.open()
+
+    def _step(self, node: Node, passage: Passage) -> None:
+        begin = time.perf_counter_ns()
+        try:
+            passage.outputs[node.name] = self._call(node, passage)
+        except Exception as error:
+            passage.failed = (node, error)
+        else:
+            passage.durations_ns[node.name] = time.perf_counter_ns() - begin
+
+    def _call(self, node: Node, passage: Passage) -> tuple[Any, ...]:
+        frame = passage.frame
+        arguments = {name: _follow(link, passage.outputs) for name, link in node.links.items()}
+        if node.ports.wants_rng:
+            name_key = zlib.crc32(node.name.encode())
+            arguments["rng"] = np.random.default_rng(
+                [self.plan.seed, name_key, frame.header.sequence]
+            )
+        result = node.plugin.process(**arguments)  # type: ignore[attr-defined]
+        values = result if isinstance(result, tuple) else (result,)
+        seen = [value for value in arguments.values() if isinstance(value, RgbdFrame)]
+        _check_outputs(node, values, seen[0] if seen else frame)
+        return values
+
+
+@contextmanager
+def cores_shared() -> Iterator[None]:
+    """Let the threads of a run share two cores well, while it lasts."""
+    import cv2
+
+    interval, helpers = sys.getswitchinterval(), cv2.getNumThreads()
+    # A stage that comes back from a kernel asks for the interpreter, and would wait for the 5 ms
+    # that Python gives a sink by default.
+    sys.setswitchinterval(5e-4)
+    # The cores are busy with stages and sinks; OpenCV's own threads would only spin beside them.
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(interval)
+        cv2.setNumThreads(helpers)
+
+
+def sink_inputs(node: Node, trace: Trace) -> dict[str, Any]:
+    """Return what a sink asks for, by the name of its parameter."""
+    inputs = {name: _follow(link, trace.outputs) for name, link in node.links.items()}
+    for port in node.ports.inputs:
+        if port.type is Trace:
+            inputs[port.name] = trace
+    return inputs
+
+
+def _follow(link: Link, outputs: Mapping[str, tuple[Any, ...]]) -> Any:
+    return outputs[link.producer][link.output]
+
+
+def _check_outputs(node: Node, values: tuple[Any, ...], frame: RgbdFrame) -> None:
+    """Raise TypeError or ValueError where outputs are not as declared, or do not fit the frame."""
+    expected = node.ports.outputs
+    matches = len(values) == len(expected) and all(map(isinstance, values, expected))
+    if not matches:
+        raise TypeError(
+            f"it returned ({', '.join(type(v).__name__ for v in values)}), "
+            f"declared is ({', '.join(t.__name__ for t in expected)})"
+        )
+    height, width = frame.color.shape[:2]
+    for value in values:
+        if isinstance(value, Mask) and value.foreground.shape != (height, width):
+            shape = value.foreground.shape
+            raise ValueError(f"its mask is {shape[1]}x{shape[0]}, the frame {width}x{height}")
