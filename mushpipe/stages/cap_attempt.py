@@ -11,14 +11,7 @@ from typing import Any
 import numpy as np
 
 from mushpipe.core.jit import jit
-from mushpipe.stages.cap_model import (
-    HEIGHT,
-    ROOM,
-    SIZE,
-    UNKNOWNS,
-    Floats,
-    Singles,
-)
+from mushpipe.stages.cap_model import HEIGHT, ROOM, SIZE, UNKNOWNS, Floats, Singles
 from mushpipe.stages.cap_outline import expected_reach, sample_outline
 from mushpipe.stages.cap_regrow import denials, regrow
 from mushpipe.stages.cap_samples import (
@@ -38,7 +31,7 @@ ODD = 0.5  # misfit at which is looked whether depth denies the outline:
 DENIED = 4  # in so many of 32 directions, and the circle is put right;
 DENIAL = 0.05  # each counts as so much misfit,
 MENDED = 0.7  # and so much smaller the sum must be in another circle
-COUNTS = 7
+COUNTS = 7  # numbers that are kept of a fit, see `fit_circle`
 
 
 @jit
@@ -106,13 +99,16 @@ def attempt(
 
 
 @jit
+def blank() -> Any:
+    """Return room for a fit: rays (6, ROOM), parameters (15,), covariance (8, 8), counts (7,)."""
+    rays = np.empty((6, ROOM), np.float32)
+    return rays, np.empty(SIZE), np.empty((UNKNOWNS, UNKNOWNS)), np.zeros(COUNTS)
+
+
+@jit
 def scratch() -> Any:
-    """Return room to fit in: a `workspace`, and twice rays, parameters, covariance and counts."""
-    one = (np.empty((6, ROOM), np.float32), np.empty(SIZE), np.empty((UNKNOWNS, UNKNOWNS)),
-           np.zeros(COUNTS))  # fmt: skip
-    two = (np.empty((6, ROOM), np.float32), np.empty(SIZE), np.empty((UNKNOWNS, UNKNOWNS)),
-           np.zeros(COUNTS))  # fmt: skip
-    return workspace(), one, two
+    """Return room to work in: a `workspace`, and two fits, of another start and another circle."""
+    return workspace(), blank(), blank()
 
 
 @jit

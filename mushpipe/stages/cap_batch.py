@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
-from mushpipe.stages.cap_attempt import ODD, POOR, fit_circle, mend, scratch
+from mushpipe.stages.cap_attempt import COUNTS, ODD, POOR, fit_circle, mend, scratch
 from mushpipe.stages.cap_model import (
     HEIGHT,
     RADIUS,
@@ -35,7 +35,8 @@ from mushpipe.stages.cap_solve import ROUND, Noise, invert, refine, tilt, worksp
 from mushpipe.stages.cap_start import spread_of
 
 ROUNDNESS = 0.01  # in rim radii: how far the rim of a cap is from the circle of its area
-GUESSED = 0.1  # in rim radii: how far off an outline is that no depth edge confirms
+GUESSED = 0.1  # in rim radii: how far off an outline is that no depth edge confirms,
+SEEN = 5  # and with what power of the share that is not confirmed that grows
 LEVER = 1.5  # rad of tilt per outline error in rim radii
 
 
@@ -185,7 +186,7 @@ def fit_caps(
         np.full((n, SIZE), np.nan),
         np.full((n, UNKNOWNS, UNKNOWNS), np.nan),
         np.full((n, 6), np.nan),
-        np.zeros((n, 7)),
+        np.zeros((n, COUNTS)),
     )
     rays = np.empty((n, 6, ROOM), np.float32)
     ranked = (gray, (*image, np.full(image[0].shape, n, np.int16)), focal)
@@ -200,7 +201,7 @@ def _fits(caps: Floats, covariances: Floats, surfaces: Floats, counts: Floats) -
     for array in (caps, covariances, surfaces):
         array[~valid] = np.nan
     diagonal = np.diagonal(covariances, axis1=1, axis2=2)
-    guessed = GUESSED * (1 - counts[:, 1] / DIRECTIONS) ** 5
+    guessed = GUESSED * (1 - counts[:, 1] / DIRECTIONS) ** SEEN
     astray = counts[:, 6] > ASTRAY * (counts[:, 0] + counts[:, 6])
     doubt = np.maximum(counts[:, 5] / POOR, 1)
     center, axis = caps[:, :3], caps[:, N : N + 3]
