@@ -69,6 +69,8 @@ train: $(STAMP) system-libraries
 	for part in 0 1; do $(BIN)/python -m training.net.scenes --part $$part --of 2 & pids="$$pids $$!"; \
 	  done; for pid in $$pids; do wait $$pid || exit 1; done
 	for seed in 0 1 2; do $(BIN)/python -m training.net.train --seed $$seed --out $(NET)/seed-$$seed.pt && \
+	  $(BIN)/python -m training.net.train --seed 1$$seed --start $(NET)/seed-$$seed.pt --steps 1500 \
+	    --rate 1e-3 --near 0.5 --out $(NET)/seed-$$seed.pt && \
 	  $(BIN)/python -m training.net.export --weights $(NET)/seed-$$seed.pt --out $(NET)/seed-$$seed.onnx \
 	  || exit 1; done
 	$(BIN)/python -m training.net.judge --peers --models $(NET)/seed-{0,1,2}.onnx

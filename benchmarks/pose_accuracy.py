@@ -166,10 +166,7 @@ def main() -> None:
                 taken = frames(scene, seed, options.family, 5, options.cache)
                 circles, rows = detected(taken[0])
                 for method, run in methods.items():
-                    if (
-                        method.startswith(("registration", "ICP"))
-                        and seed - first >= options.registration
-                    ):
+                    if method.startswith(SLOW) and seed - first >= options.registration:
                         continue
                     if method.startswith("floor"):
                         clean = frames(scene, seed, options.family, 1, options.cache, sensor=EXACT)
@@ -178,7 +175,8 @@ def main() -> None:
                     else:
                         tallies[method].add(*run(taken, circles), taken[0], rows)
         for method, tally in tallies.items():
-            print(f"{name:9s} {method:22s} {tally.row()}", flush=True)
+            if tally.rows:
+                print(f"{name:9s} {method:22s} {tally.row()}", flush=True)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
+from mushpipe.stages.cap_attempt import COUNTS, ODD, POOR, fit_circle, mend, scratch
 from mushpipe.stages.cap_model import (
     HEIGHT,
     RADIUS,
@@ -24,24 +25,18 @@ from mushpipe.stages.cap_model import (
     slope,
 )
 from mushpipe.stages.cap_order import rank_by_depth
-from mushpipe.stages.cap_outline import sample_outline
 from mushpipe.stages.cap_samples import (
     ASTRAY,
     CELLS,
-    COMPASS,
     DIRECTIONS,
     ray_at,
-    sample_depth,
-    sample_edges,
-    touch,
 )
 from mushpipe.stages.cap_solve import ROUND, Noise, invert, refine, tilt, workspace
-from mushpipe.stages.cap_start import CONICAL, USUAL, axis_of, spread_of, start
+from mushpipe.stages.cap_start import spread_of
 
-POOR = 0.9  # misfit (a usual cap has 0.25) at which a fit starts again; it widens the sigmas, too
-BETTER = 0.8  # how much smaller the misfit of another start must be
 ROUNDNESS = 0.01  # in rim radii: how far the rim of a cap is from the circle of its area
-GUESSED = 0.1  # in rim radii: how far off an outline is that no depth edge confirms
+GUESSED = 0.1  # in rim radii: how far off an outline is that no depth edge confirms,
+SEEN = 5  # and with what power of the share that is not confirmed that grows
 LEVER = 1.5  # rad of tilt per outline error in rim radii
 
 
@@ -85,70 +80,6 @@ class Fits:
 
 
 @jit
-def gather(
-    image: Any,
-    circle: Floats,
-    rank: int,
-    focal: float,
-    sensor: tuple[float, float, float, float],
-    rays: Singles,
-) -> tuple[int, int, int, float]:
-    """Take the rays of a cap; return what there is of it.
-
-    Returns:
-        Numbers of its points, of points of other depth and of edge rays; its middle depth, m.
-    """
-    n, other, middle = sample_depth(
-        image, rank, circle, focal, (sensor[0], sensor[1]), rays[:, ROUND:]
-    )
-    if n == 0:
-        return 0, other, 0, 0.0
-    for j in range(ROUND, ROUND + n):
-        rays[3, j] -= sensor[2] / rays[2, j]
-    m = sample_edges(image, rank, circle, focal, middle, sensor[3], rays[:, ROUND + n :])
-    for j in range(ROUND):
-        turn = COMPASS[j * (DIRECTIONS // ROUND)]
-        x, y = circle[0] + circle[2] * turn[0], circle[1] + circle[2] * turn[1]
-        touch(rays, j, ray_at(image[1], focal, x, y), 0.0, 0.0)
-    return n, other, m, middle - sensor[2]
-
-
-@jit
-def attempt(
-    frame: Any, circle: Floats, rank: int, size: float, seen: tuple[Singles, int],
-    upright: tuple[Floats, float], settings: Any, fit: tuple[Floats, Floats], work: Any,
-) -> tuple[int, float]:  # fmt: skip
-    """Fit a cap from where it starts: to its depth, then to its outline in colour as well.
-
-    Args:
-        frame: As in `first_fits`.
-        circle: (3,) x, y, radius, px.
-        rank: Of the circle.
-        size: Its radius at the cap, m.
-        seen: The cap's rays (6, ROOM), with room for those of the outline, and how many there are.
-        upright: Unit vector (3,) and spread of tilts, rad.
-        settings: As in `first_fits`.
-        fit: Parameters (15,), in and out, and covariance (8, 8), out.
-        work: From `workspace`.
-
-    Returns:
-        Number of rays along the outline in colour, and the misfit, infinite without a solution.
-    """
-    gray, image, focal = frame
-    (rays, count), (cap, covariance), setting = seen, fit, (settings[0], 1.0 / focal, size)
-    if refine(cap, rays, count, upright, setting, (0, 2), work)[0] < 0.0:
-        return 0, np.inf
-    lines = sample_outline(
-        gray, image[1], image[2], rank, cap, circle, focal, settings[2], work[1], rays[:, count:]
-    )
-    total, misfit = refine(cap, rays, count + lines, upright, setting, (2, 4), work)
-    if total < 0.0:
-        return 0, np.inf
-    invert(work[0][0], covariance)
-    return lines, misfit
-
-
-@jit
 def first_fits(
     frame: Any, circles: Floats, upright: tuple[Floats, float], settings: Any, rays: Singles,
     out: Any,
@@ -162,42 +93,16 @@ def first_fits(
         settings: `Noise`; sigma of depth (2), bias (m) and edge offset (px); sigma of the outline
             in colour, px; fewest points.
         rays: (N, 6, ROOM) room for those of each cap.
-        out: Per cap parameters, covariance, surface point with sigmas, and counts of points, edge
-            rays, outline rays, weight; size, m; misfit; points of other depth. A cap without a fit
-            keeps a count of 0.
+        out: Per cap parameters, covariance, surface point with sigmas, and counts as `fit_circle`
+            fills them. A cap without a fit keeps a count of 0.
     """
-    _, image, focal = frame
     caps, covariances, _, counts = out
-    rank, work = rank_by_depth(image[0], circles, image[2]), workspace()
-    rival = (np.empty(SIZE), np.empty((UNKNOWNS, UNKNOWNS)))
-    spare = np.empty((6, ROOM), np.float32)
+    rank, room = rank_by_depth(frame[1][0], circles, frame[1][2]), scratch()
     for i in range(len(circles)):
-        circle, fit = circles[i], (caps[i], covariances[i])
-        n, other, m, middle = gather(image, circle, rank[i], focal, settings[1], rays[i])
-        if n < settings[3] or middle <= 0.0:
-            continue
-        size, count = circle[2] * middle / focal, ROUND + n + m
-        ray = ray_at(image[1], focal, circle[0], circle[1])
-        points = rays[i][:, ROUND:]
-        axis = axis_of(points, n, upright[0], ray, USUAL[0])
-        start(caps[i], axis, USUAL, ray, middle, size)
-        lines, misfit = attempt(
-            frame, circle, rank[i], size, (rays[i], count), upright, settings, fit, work
-        )
-        if misfit > POOR:
-            spare[:, :count] = rays[i][:, :count]
-            leaning = axis_of(points, n, upright[0], ray, CONICAL[0])
-            for axis in (upright[0], -np.array(ray), leaning):
-                start(rival[0], axis, CONICAL, ray, middle, size)
-                found, rest = attempt(
-                    frame, circle, rank[i], size, (spare, count), upright, settings, rival, work
-                )
-                if rest < BETTER * misfit:
-                    lines, misfit, rays[i][:, count:] = found, rest, spare[:, count:]
-                    caps[i], covariances[i] = rival
-        if np.isfinite(misfit):
-            counts[i, 0], counts[i, 1], counts[i, 2], counts[i, 4] = n, m, lines, size
-            counts[i, 6] = other
+        fit, ranks = (rays[i], caps[i], covariances[i], counts[i]), (rank[i], len(circles))
+        misfit = fit_circle(frame, circles[i], rank[i], upright, settings, fit, room)
+        if ODD < misfit < np.inf:
+            mend(frame, circles[i], ranks, misfit, upright, settings, fit, room)
 
 
 @jit
@@ -281,7 +186,7 @@ def fit_caps(
         np.full((n, SIZE), np.nan),
         np.full((n, UNKNOWNS, UNKNOWNS), np.nan),
         np.full((n, 6), np.nan),
-        np.zeros((n, 7)),
+        np.zeros((n, COUNTS)),
     )
     rays = np.empty((n, 6, ROOM), np.float32)
     ranked = (gray, (*image, np.full(image[0].shape, n, np.int16)), focal)
@@ -296,7 +201,7 @@ def _fits(caps: Floats, covariances: Floats, surfaces: Floats, counts: Floats) -
     for array in (caps, covariances, surfaces):
         array[~valid] = np.nan
     diagonal = np.diagonal(covariances, axis1=1, axis2=2)
-    guessed = GUESSED * (1 - counts[:, 1] / DIRECTIONS) ** 5
+    guessed = GUESSED * (1 - counts[:, 1] / DIRECTIONS) ** SEEN
     astray = counts[:, 6] > ASTRAY * (counts[:, 0] + counts[:, 6])
     doubt = np.maximum(counts[:, 5] / POOR, 1)
     center, axis = caps[:, :3], caps[:, N : N + 3]

@@ -71,6 +71,25 @@ def substitute(factor: Floats, vector: Floats) -> None:
 
 
 @jit
+def solve3(matrix: Floats, right: Floats, out: Floats) -> bool:
+    """Fill the solution (3,) of a symmetric system; False where it has none.
+
+    By Cramer's rule: numpy's solvers take seconds to compile into a kernel.
+    """
+    a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
+    d, e, f = matrix[1, 1], matrix[1, 2], matrix[2, 2]
+    p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
+    det = a * p + b * q + c * r
+    if not abs(det) > 1e-16:
+        return False
+    s, t, u = a * f - c * c, b * c - a * e, a * d - b * b
+    out[0] = (p * right[0] + q * right[1] + r * right[2]) / det
+    out[1] = (q * right[0] + s * right[1] + t * right[2]) / det
+    out[2] = (r * right[0] + t * right[1] + u * right[2]) / det
+    return True
+
+
+@jit
 def tukey(squared: float, cut: float) -> float:
     """Return Tukey's weight of a squared, normalised residual."""
     rest = max(1.0 - squared / cut, 0.0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mushpipe.core.jit import jit
+from mushpipe.stages.cap_linear import solve3
 from mushpipe.stages.cap_model import BULGE, HEIGHT, RADIUS, Floats, N, Singles, Vector, span
 
 ASPECT = 0.62
@@ -27,15 +28,9 @@ def plane(points: Singles, count: int, ray: Vector, out: Floats) -> bool:
             right[i] += row[i] * far * points[2, j]
             for k in range(3):
                 matrix[i, k] += row[i] * row[k]
-    # Cramer's rule; numpy's solvers take seconds to compile into a kernel
-    a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
-    d, e, f = matrix[1, 1], matrix[1, 2], matrix[2, 2]
-    p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
-    det = a * p + b * q + c * r
-    if not abs(det) > 1e-16:
+    if not solve3(matrix, right, out):
         return False
-    x = (p * right[0] + q * right[1] + r * right[2]) / det
-    y = (q * right[0] + (a * f - c * c) * right[1] + (b * c - a * e) * right[2]) / det
+    x, y = out[0], out[1]
     norm = np.sqrt(x * x + y * y + 1.0)
     out[0], out[1], out[2] = x / norm, y / norm, -1.0 / norm
     return True

@@ -15,9 +15,18 @@ SMALLEST = 5.0  # px; smaller outlines are not asked for
 HIDDEN = 0.3  # nor are those of which less is seen
 
 
-def crop(picture: Picture, size: int, rng: np.random.Generator) -> tuple[Singles, Singles, Singles]:
-    """Return an image (3, size, size) in 0..1, its target (5, h, w) and weight (h, w)."""
-    matrix, scale = _placement(picture, size, rng)
+def crop(
+    picture: Picture, size: int, rng: np.random.Generator, near: float = 0.0
+) -> tuple[Singles, Singles, Singles]:
+    """Return an image (3, size, size) in 0..1, its target (5, h, w) and weight (h, w).
+
+    Args:
+        picture: A frame.
+        size: px, a multiple of 32.
+        rng: Draws everything.
+        near: Share of the crops that are taken around a cap; the others lie anywhere.
+    """
+    matrix, scale = _placement(picture, size, rng, near)
     color = cv2.warpAffine(
         picture.color, matrix, (size, size), flags=cv2.INTER_LINEAR,
         borderValue=rng.integers(0, 256, 3).tolist(),
@@ -33,7 +42,7 @@ def crop(picture: Picture, size: int, rng: np.random.Generator) -> tuple[Singles
 
 
 def _placement(
-    picture: Picture, size: int, rng: np.random.Generator
+    picture: Picture, size: int, rng: np.random.Generator, near: float
 ) -> tuple[NDArray[np.float64], float]:
     """Draw an affine map (2, 3) of the frame onto the crop, and its scale."""
     scale = float(np.exp(rng.uniform(np.log(0.5), np.log(2.2))))
@@ -43,7 +52,11 @@ def _placement(
     linear[0] *= rng.choice([-1.0, 1.0])
     height, width = picture.cap.shape
     reach = min(0.45 * size / scale, 0.4 * height)
-    middle = rng.uniform((reach, reach), (width - reach, height - reach))
+    low, high = np.array((reach, reach)), np.array((width - reach, height - reach))
+    middle = rng.uniform(low, high)
+    if len(picture.circles) and rng.random() < near:
+        cap = picture.circles[rng.integers(len(picture.circles)), :2]
+        middle = np.clip(cap + rng.normal(0, 0.2 * size / scale, 2), low, high)
     return np.column_stack([linear, size / 2 - linear @ middle]), scale
 
 

@@ -24,13 +24,14 @@ SIZE, BATCH, RATE, DECAY = 224, 8, 2.5e-3, 0.998
 class Crops:
     """Batches from the frames, with a generator of their own."""
 
-    def __init__(self, frames: list[Picture], seed: int) -> None:
+    def __init__(self, frames: list[Picture], seed: int, near: float) -> None:
         self._frames, self._rng = frames, np.random.default_rng([seed, 9])
+        self._near = near
 
     def batch(self) -> tuple[torch.Tensor, ...]:
         """Return images, targets and weights."""
         picks = self._rng.integers(len(self._frames), size=BATCH)
-        rows = [crop(self._frames[k], SIZE, self._rng) for k in picks]
+        rows = [crop(self._frames[k], SIZE, self._rng, self._near) for k in picks]
         return tuple(torch.from_numpy(np.stack(part)) for part in zip(*rows, strict=True))
 
 
@@ -45,16 +46,14 @@ def averaged(slow: nn.Module, fast: nn.Module, step: int) -> None:
                 a.copy_(b)
 
 
-def train(frames: list[Picture], steps: int, seed: int, out: Path) -> None:
+def train(net: CapNet, crops: Crops, steps: int, rate: float, out: Path) -> None:
     """Train a network and write the running mean of its weights, every hundred steps.
 
     AdamW with a linear warm-up over 100 steps and a cosine to zero.
     """
-    torch.manual_seed(seed)
-    net = CapNet().to(memory_format=torch.channels_last)
+    net = net.to(memory_format=torch.channels_last)
     slow = copy.deepcopy(net)
-    crops = Crops(frames, seed)
-    optimizer = torch.optim.AdamW(net.parameters(), RATE, weight_decay=1e-3)
+    optimizer = torch.optim.AdamW(net.parameters(), rate, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimizer,
         lambda k: min(1.0, (k + 1) / 100) * 0.5 * (1 + np.cos(np.pi * k / steps)),
@@ -85,13 +84,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cache", type=Path, default=Path("out/net"), help="rendered frames")
     parser.add_argument("--frames", type=int, default=TRAINING)
-    parser.add_argument("--steps", type=int, default=3500)
+    parser.add_argument("--steps", type=int, default=5000)
+    parser.add_argument("--rate", type=float, default=RATE, help="largest learning rate")
+    parser.add_argument("--near", type=float, default=0.0, help="share of crops around a cap")
+    parser.add_argument("--start", type=Path, help="weights to go on from")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("out/net/cap-net.pt"))
     arguments = parser.parse_args()
     seeds = range(TRAINING_SEED, TRAINING_SEED + arguments.frames)
     frames = [picture(seed, arguments.cache) for seed in seeds]
-    train(frames, arguments.steps, arguments.seed, arguments.out)
+    torch.manual_seed(arguments.seed)
+    net = CapNet()
+    if arguments.start:
+        net.load_state_dict(torch.load(arguments.start))
+    crops = Crops(frames, arguments.seed, arguments.near)
+    train(net, crops, arguments.steps, arguments.rate, arguments.out)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,142 @@
+"""Where depth denies a fitted cap, and the circle that it suggests in place of the detected one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mushpipe.core.jit import jit
+from mushpipe.stages.cap_linear import solve3, tukey
+from mushpipe.stages.cap_model import HEIGHT, RADIUS, Floats, N
+from mushpipe.stages.cap_samples import COMPASS, DIRECTIONS
+
+FROM, TO = 0.3, 2.2  # in radii of the circle: where the surface in it may end
+JUMP = 0.35  # in radii of the cap: its depth does not change so much from pixel to pixel
+LOST = 6  # px without depth, beyond which nobody knows where a surface ended
+FEWEST = 6  # ends that make a circle
+ROUNDS = 8
+HELD = np.array([0.02, 0.02, 0.05])  # weight of the detected x, y and radius, that of an end is 1
+
+
+@jit
+def look(image: Any, circle: Floats, j: int, far: float) -> tuple[float, int]:
+    """Return depth (m, 0 = missing) and rank (-1 out of the image) in a direction of `COMPASS`.
+
+    Args:
+        image: Depth (H, W) m; rays; ranks (H, W), as many as there are circles where there is none.
+        circle: (3,) x, y, radius, px.
+        j: Number of the direction.
+        far: Distance from the centre, px.
+    """
+    depth, _, ranks = image
+    u = int(np.floor(circle[0] + far * COMPASS[j, 0] + 0.5))
+    v = int(np.floor(circle[1] + far * COMPASS[j, 1] + 0.5))
+    if 0 <= v < depth.shape[0] and 0 <= u < depth.shape[1]:
+        return float(depth[v, u]), int(ranks[v, u])
+    return 0.0, -1
+
+
+@jit
+def denials(
+    image: Any, ranks: tuple[int, int], cap: Floats, bias: float, circle: Floats, reach: Floats
+) -> int:
+    """Return in how many directions depth denies the outline of a fitted cap.
+
+    There the surface goes on outside of it, and not as another circle's, or has ended inside.
+
+    Args:
+        image: As in `look`.
+        ranks: Of the cap's circle, and of no circle.
+        cap: (15,) the cap.
+        bias: Of the depth, m.
+        circle: (3,) x, y, radius, px.
+        reach: (DIRECTIONS,) how far the outline lies from the circle's centre, px.
+    """
+    rim = cap[2] + bias
+    low, high = rim + cap[HEIGHT] * cap[N + 2] - 0.3 * cap[RADIUS], rim + 0.5 * cap[RADIUS]
+    count = 0
+    for j in range(DIRECTIONS):
+        margin = max(2.0, 0.1 * reach[j])
+        inside, here = look(image, circle, j, reach[j] - margin)
+        outside, there = look(image, circle, j, reach[j] + margin)
+        if here < ranks[0] or there < ranks[0]:
+            continue
+        goes_on = inside > 0.0 and low < outside < high and there in ranks
+        count += inside > high or goes_on
+    return count
+
+
+@jit
+def end_along(
+    image: Any, ranks: tuple[int, int], circle: Floats, j: int, gate: tuple[float, float, float]
+) -> float:
+    """Return how far (px) a surface reaches until something deeper follows; -1 if none is seen to.
+
+    Args:
+        image: As in `look`.
+        ranks: Of the circle, and of none: a pixel of another's is no end of this surface.
+        circle: (3,) x, y, radius, px.
+        j: Number of the direction.
+        gate: Between which depths the surface lies, and by how much they may jump, m.
+    """
+    last, missing, start = 0.0, 0, FROM * circle[2]
+    for k in range(int((TO - FROM) * circle[2])):
+        z, rank = look(image, circle, j, start + k)
+        if rank not in ranks or missing > LOST:
+            return -1.0
+        if z <= 0.0:
+            missing += 1
+        elif z > gate[1] or (last > 0.0 and z - last > gate[2]):
+            return float(start + k - missing - 0.5)
+        elif z < gate[0] or last - z > gate[2]:
+            return -1.0
+        else:
+            last, missing = z, 0
+    return -1.0
+
+
+@jit
+def regrow(
+    image: Any, ranks: tuple[int, int], circle: Floats, focal: float, middle: float, out: Floats
+) -> bool:
+    """Fill the circle (3,) around the surface in a circle, by where it ends; False if unknown.
+
+    Args:
+        image: As in `look`.
+        ranks: Of the circle, and of none.
+        circle: (3,) x, y, radius, px.
+        focal: Focal length, px.
+        middle: Depth of the surface, m.
+        out: (3,) out.
+    """
+    size, n = circle[2] * middle / focal, 0
+    gate = (middle - 0.8 * size, middle + 1.3 * size, JUMP * size)
+    ends = np.empty((2, DIRECTIONS))
+    for j in range(DIRECTIONS):
+        far = end_along(image, ranks, circle, j, gate)
+        if far >= 0.0:
+            ends[0, n], ends[1, n] = far * COMPASS[j, 0], far * COMPASS[j, 1]
+            n += 1
+    if n < FEWEST:
+        return False
+    step, matrix, off = np.zeros(3), np.empty((3, 3)), np.array([0.0, 0.0, circle[2]])
+    for k in range(ROUNDS):
+        matrix[:] = np.diag(HELD)
+        right = HELD * (np.array([0.0, 0.0, circle[2]]) - off)
+        cut = max(0.6 - 0.1 * k, 0.2) * off[2]
+        for j in range(n):
+            x, y = ends[0, j] - off[0], ends[1, j] - off[1]
+            far = max(np.sqrt(x * x + y * y), 1e-9)
+            row = (x / far, y / far, 1.0)
+            weight = tukey((far - off[2]) ** 2, cut * cut)
+            for a in range(3):
+                right[a] += weight * row[a] * (far - off[2])
+                for b in range(3):
+                    matrix[a, b] += weight * row[a] * row[b]
+        if not solve3(matrix, right, step):
+            return False
+        off += step
+        off[2] = min(max(off[2], 0.6 * circle[2]), 2.0 * circle[2])
+    out[0], out[1], out[2] = circle[0] + off[0], circle[1] + off[1], off[2]
+    return True

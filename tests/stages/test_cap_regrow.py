@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mushpipe import Circles
+from mushpipe.stages.cap_fit import CapFit
+from mushpipe.stages.cap_linear import solve3
+from mushpipe.stages.cap_model import SIZE, span
+from mushpipe.stages.cap_regrow import denials, regrow
+from mushpipe.stages.cap_samples import DIRECTIONS
+from mushpipe.stages.upright import pixel_rays
+from tests.stages.caps import CAMERA, cap, circles_of, draw, frame_from
+
+BED = 0.44
+LOW = cap(15, 60, (0, 0, 0.4), 0.022, 0.55)
+
+
+def seen(*caps: object) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Depth, rays, and ranks without a circle, of one."""
+    depth, _ = draw(list(caps), BED)
+    return depth.astype(np.float32), pixel_rays(CAMERA), np.ones(depth.shape, np.int16)
+
+
+@given(st.integers(0, 2**31))
+def test_three_equations_are_solved_as_numpy_does(seed: int) -> None:
+    rows = np.random.default_rng(seed).normal(size=(3, 5))
+    right, out = rows[:, 0].copy(), np.empty(3)
+    assert solve3(rows @ rows.T, right, out)
+    assert out == pytest.approx(np.linalg.solve(rows @ rows.T, right), rel=1e-6, abs=1e-6)
+
+
+def test_equations_without_a_solution_are_refused() -> None:
+    assert not solve3(np.ones((3, 3)), np.ones(3), np.empty(3))
+
+
+@pytest.mark.parametrize("wrong", [(4.0, 3.0, 0.8), (-5.0, 0.0, 1.25), (0.0, 6.0, 1.0)])
+def test_a_surface_is_followed_to_where_it_ends(wrong: tuple[float, float, float]) -> None:
+    circles = circles_of([LOW])
+    true = np.append(circles.center[0], circles.radius[0])
+    circle = true * [1, 1, wrong[2]] + [wrong[0], wrong[1], 0]
+    found = np.empty(3)
+    assert regrow(seen(LOW), (0, 1), circle, CAMERA.fx, 0.395, found)
+    assert np.abs(found - true).max() < 1.0
+
+
+def test_a_surface_without_an_end_gives_no_circle() -> None:
+    image = seen(LOW)
+    endless = np.where(image[0] < BED, image[0], np.float32(0)), *image[1:]
+    circles = circles_of([LOW])
+    circle = np.append(circles.center[0], circles.radius[0])
+    assert not regrow(endless, (0, 1), circle, CAMERA.fx, 0.395, np.empty(3))
+
+
+def test_depth_denies_a_cap_that_is_too_small_or_too_large_and_no_other() -> None:
+    circles = circles_of([LOW])
+    circle = np.append(circles.center[0], circles.radius[0])
+    values = np.zeros(SIZE)
+    values[:3], values[3:6], values[6:8] = LOW.center, LOW.axis, (LOW.radius, LOW.height)
+    span(values)
+    counts = [
+        denials(seen(LOW), (0, 1), values, 0.0, circle, np.full(DIRECTIONS, reach * circle[2]))
+        for reach in (0.7, 1.0, 1.3)
+    ]
+    assert counts[0] > 25
+    assert counts[1] < 3
+    assert counts[2] > 25
+
+
+@pytest.mark.parametrize("wrong", [(7.0, 5.0, 1.3), (5.0, -6.0, 1.2)])
+def test_a_cap_is_found_in_a_circle_that_is_off(wrong: tuple[float, float, float]) -> None:
+    depth, gray = draw([LOW], BED)
+    circles = circles_of([LOW])
+    shifted = Circles(circles.center + wrong[:2], circles.radius * wrong[2], circles.score)
+    locations, poses = CapFit(up="camera", edge_offset_px=0).process(
+        frame_from(depth, gray), shifted
+    )
+    assert poses.axis[0] @ LOW.axis > np.cos(np.radians(3))
+    assert locations.diameter[0] == pytest.approx(0.044, abs=1.5e-3)
