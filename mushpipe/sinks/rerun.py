@@ -56,8 +56,8 @@ class RerunSink(Sink):
     jpeg_quality: int = Field(85, ge=1, le=100, description="quality of the stored colour images")
     index: bool = Field(
         True,
-        description="end the file with an index, for Rerun's tools; until then it takes memory, some "
-        "35 KB a frame, which is too much for hours",
+        description="end the file with an index, for Rerun's tools; until then it takes memory, "
+        "some 35 KB a frame, which is too much for hours",
     )
     cloud_step: int = Field(3, ge=1, description="pixels between the points of the cloud")
 
