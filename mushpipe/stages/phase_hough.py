@@ -84,14 +84,12 @@ class PhaseHough(Stage):
     diameter_mm: tuple[Positive, Positive] = Field(
         (8, 120), description="smallest and largest diameter, mm, where there is depth"
     )
-    min_score: float = Field(
-        0.4, ge=0, le=1, description="smallest score that is kept; chosen on simulated beds"
-    )
+    min_score: float = Field(0.5, ge=0, le=1, description="smallest score that is kept")
     edge: float = Field(
         0.25, gt=0, le=2, description="least gradient, in units of Otsu's threshold of gradients"
     )
     evidence: float = Field(
-        0.09, ge=0.01, le=1, description="least share of an outline that votes, for a candidate"
+        0.07, ge=0.01, le=1, description="least share of an outline that votes, for a candidate"
     )
     use_depth: bool = Field(True, description="false ignores depth")
     use_learned: bool = Field(
