@@ -15,6 +15,7 @@ from mushpipe.stages.cap_model import HEIGHT, ROOM, SIZE, UNKNOWNS, Floats, Sing
 from mushpipe.stages.cap_outline import expected_reach, sample_outline
 from mushpipe.stages.cap_regrow import denials, regrow
 from mushpipe.stages.cap_samples import (
+    ASTRAY,
     COMPASS,
     DIRECTIONS,
     ray_at,
@@ -163,6 +164,8 @@ def mend(
 ) -> None:  # fmt: skip
     """Fit again in the circle that depth suggests, where depth denies the fit; the better stays.
 
+    Not where much of the circle's depth lies elsewhere: it would be fitted to whatever hides it.
+
     Args:
         frame: As in `cap_batch.first_fits`.
         circle: (3,) x, y, radius, px, as detected.
@@ -175,6 +178,8 @@ def mend(
     """
     _, image, focal = frame
     bias, (work, _, other) = settings[1][2], room
+    if fit[3][6] > ASTRAY * (fit[3][0] + fit[3][6]):
+        return
     reach, grown = np.empty(DIRECTIONS), np.empty(3)
     expected_reach(fit[1], image[1], focal, circle, work[1], reach)
     denied = denials(image, ranks, fit[1], bias, circle, reach)
