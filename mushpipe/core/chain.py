@@ -29,6 +29,7 @@ class Turnstile:
     def __init__(self) -> None:
         self._next = 0
         self._open = False
+        self._inside = threading.Lock()
         self._changed = threading.Condition()
 
     def wait(self, ticket: int) -> None:
@@ -41,14 +42,15 @@ class Turnstile:
         """Wait for the turn of a ticket, and end it on leaving."""
         self.wait(ticket)
         try:
-            yield
+            with self._inside:
+                yield
         finally:
             with self._changed:
                 self._next += 1
                 self._changed.notify_all()
 
     def open(self) -> None:
-        """Let everybody through: the holder of a ticket will not come any more."""
+        """Let everybody through, out of order: the holder of a ticket will not come any more."""
         with self._changed:
             self._open = True
             self._changed.notify_all()

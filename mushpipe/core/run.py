@@ -22,6 +22,8 @@ from mushpipe.core.types import RgbdFrame
 logger = logging.getLogger("mushpipe")
 Progress = Callable[[RunReport], None]
 SOURCE_PATIENCE_S = 5.0
+# One more than two cores: one of them often waits for the slowest stage.
+FRAMES_AT_ONCE = 3
 
 
 def run(
@@ -136,15 +138,20 @@ class _Runner:
         return SinkThread(node, self.plan.delivery(node) == "latest", self.tolerance, durations)
 
     def _loop(self, reader: SourceThread, threads: list[SinkThread]) -> None:
-        """Take frames through the stages on two threads, until there are no more or one fails."""
+        """Take frames through the stages on several threads, until they end or one fails."""
         for thread in (reader, *threads):
             thread.start()
-        second = threading.Thread(
-            target=self._work, args=(reader, threads), name="mushpipe-stages", daemon=True
-        )
-        second.start()
+        others = [
+            threading.Thread(
+                target=self._work, args=(reader, threads), name="mushpipe-stages", daemon=True
+            )
+            for _ in range(FRAMES_AT_ONCE - 1)
+        ]
+        for other in others:
+            other.start()
         self._work(reader, threads)
-        second.join()
+        for other in others:
+            other.join()
         self.report.interrupted = self.stop.is_set()
         if self.failure is not None:
             raise self.failure
