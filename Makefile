@@ -75,6 +75,12 @@ train: $(STAMP) system-libraries
 	  || exit 1; done
 	$(BIN)/python -m training.net.judge --peers --models $(NET)/seed-{0,1,2}.onnx
 
+# A long replay with every sink attached, whose memory must stay flat; MINUTES=5 for a short one.
+MINUTES ?= 60
+.PHONY: soak
+soak: $(STAMP)
+	$(BIN)/python -m benchmarks.soak --minutes $(MINUTES)
+
 recordings: $(STAMP) system-libraries
 	$(BIN)/python -m mushpipe.sim.recordings
 

@@ -54,6 +54,11 @@ class RerunSink(Sink):
         None, gt=0, description="most images per second; not set: 5 of a live run, all of a replay"
     )
     jpeg_quality: int = Field(85, ge=1, le=100, description="quality of the stored colour images")
+    index: bool = Field(
+        True,
+        description="end the file with an index, for Rerun's tools; until then it takes memory, "
+        "some 35 KB a frame, which is too much for hours",
+    )
     cloud_step: int = Field(3, ge=1, description="pixels between the points of the cloud")
 
     _recording: Any = PrivateAttr(None)
@@ -80,7 +85,9 @@ class RerunSink(Sink):
 
         from mushpipe.sinks.rerun_log import log_start
 
-        sinks: list[Any] = [rr.FileSink(str(run.path(self.save)))] if self.save else []
+        sinks: list[Any] = []
+        if self.save:
+            sinks.append(rr.FileSink(str(run.path(self.save)), write_footer=self.index))
         sinks += [rr.GrpcSink(url) for url in self._viewers()]
         if not sinks:
             raise UsageError("nothing to do: set 'save', 'spawn', 'connect' or 'serve'")

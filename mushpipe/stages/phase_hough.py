@@ -84,7 +84,9 @@ class PhaseHough(Stage):
     diameter_mm: tuple[Positive, Positive] = Field(
         (8, 120), description="smallest and largest diameter, mm, where there is depth"
     )
-    min_score: float = Field(0.5, ge=0, le=1, description="smallest score that is kept")
+    min_score: float = Field(
+        0.4, ge=0, le=1, description="smallest score that is kept; chosen on simulated beds"
+    )
     edge: float = Field(
         0.25, gt=0, le=2, description="least gradient, in units of Otsu's threshold of gradients"
     )

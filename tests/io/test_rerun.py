@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -226,9 +227,12 @@ def test_warnings_stand_in_the_log_at_their_frame(tmp_path: Path) -> None:
     ]
 
 
-def test_a_live_run_shows_few_images_and_all_results(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "settings", [{"live": True}, {"live": True, "image_hz": 5}, {"image_hz": 5}], ids=str
+)
+def test_few_images_and_all_results(tmp_path: Path, settings: dict[str, Any]) -> None:
     traces = [trace_of(make_frame(i), pick=make_picks()) for i in range(31)]  # one second
-    found = show(tmp_path, traces, live=True, image_hz=5)
+    found = show(tmp_path, traces, **settings)
     stamps = np.array(found[f"{IMAGE}/color"]["capture"])
     assert stamps[0] == T0
     assert 4 <= len(stamps) <= 6
