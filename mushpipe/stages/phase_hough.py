@@ -89,7 +89,7 @@ class PhaseHough(Stage):
         0.25, gt=0, le=2, description="least gradient, in units of Otsu's threshold of gradients"
     )
     evidence: float = Field(
-        0.09, ge=0.01, le=1, description="least share of an outline that votes, for a candidate"
+        0.07, ge=0.01, le=1, description="least share of an outline that votes, for a candidate"
     )
     use_depth: bool = Field(True, description="false ignores depth")
     use_learned: bool = Field(

@@ -23,11 +23,12 @@ from training.net.scenes import varied_cases
 from training.scenes import judging_cases
 from training.verifier import NET, RADII, segmentations
 
+# Beside the network as graphs/pick-net.yaml has it.
 CLASSIC = {
     "image": PhaseHough(radius_px=RADII, use_depth=False),
     "depth": PhaseHough(radius_px=RADII),
-    "image+net": PhaseHough(radius_px=RADII, use_depth=False, use_learned=True),
-    "depth+net": PhaseHough(radius_px=RADII, use_learned=True),
+    "image+net": PhaseHough(radius_px=RADII, use_depth=False, use_learned=True, min_score=0.4),
+    "depth+net": PhaseHough(radius_px=RADII, use_learned=True, min_score=0.4),
 }
 
 
