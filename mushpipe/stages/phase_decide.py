@@ -142,8 +142,8 @@ def _use_up(edges: Edges, shape: Shape, number: int, owner: Rows, rows: Rows) ->
 
 @jit
 def decide(
-    edges: Edges, shapes: Table, hits: Rows, table: Table, depth: NDArray[np.bool_],
-    image_weights: Table, depth_weights: Table, least: float,
+    edges: Edges, shapes: Table, hits: Rows, table: Table, model: Rows,
+    weights: NDArray[np.float64], least: float,
 ) -> tuple[Rows, Table, Rows]:  # fmt: skip
     """Accept candidates in the order of their probability.
 
@@ -153,9 +153,8 @@ def decide(
         hits: (N, D) rows of the edges that support them.
         table: (N, F) features; those that depend on others are written, as they stood when the
             candidate was accepted, or at the end.
-        depth: (N,) whether a candidate's features of depth are known.
-        image_weights: (F + 1, 4) weights where they are not.
-        depth_weights: (F + 1, 4) weights where they are.
+        model: (N,) which weights decide on a candidate.
+        weights: (M, F + 1, 4) of `probability`.
         least: Smallest probability that is accepted.
 
     Returns:
@@ -171,7 +170,7 @@ def decide(
     for k in range(n):
         outline_features(edges, shapes[k], hits[k], owner, near[:0], table[k])
         overlap_features(shapes[k], near[:0], table[k])
-        chance[k] = probability(table[k], depth_weights if depth[k] else image_weights)
+        chance[k] = probability(table[k], weights[model[k]])
     for count in range(n):
         best, top = -1, least
         for k in range(n):
@@ -187,7 +186,7 @@ def decide(
                 met = _accepted(shapes, waiting, beside[first[k] : first[k + 1]], near)
                 outline_features(edges, shapes[k], hits[k], owner, near[:met], table[k])
                 overlap_features(shapes[k], near[:met], table[k])
-                chance[k] = probability(table[k], depth_weights if depth[k] else image_weights)
+                chance[k] = probability(table[k], weights[model[k]])
     return order, chance, owner
 
 

@@ -52,7 +52,6 @@ class Evidence:
         middle: (N,) m height of the middle over the bed, NaN without depth.
         height: (h, w) m over the bed at half resolution, empty without depth.
         pixel: Size of a pixel on the bed, m.
-        learned: Whether another detector was asked.
     """
 
     edges: Edges
@@ -62,7 +61,6 @@ class Evidence:
     middle: Table
     height: Plane
     pixel: float
-    learned: bool
 
 
 class PhaseHough(Stage):
@@ -164,24 +162,19 @@ class PhaseHough(Stage):
         if learned is not None:
             table[:, NAMES.index(LEARNED)] = agreement(shapes, equal_area_radius(shapes), learned)
         kept = self._plausible(shapes, middle, relief)
-        return Evidence(
-            edges, shapes[kept], hits[kept], table[kept], middle[kept], high, pixel,
-            learned is not None,
-        )  # fmt: skip
+        return Evidence(edges, shapes[kept], hits[kept], table[kept], middle[kept], high, pixel)
 
     def decide(self, found: Evidence) -> tuple[Rows, Table, Rows]:
         """Return the accepted rows in their order, all probabilities, and whose each edge is."""
         verifier = self._load()
-        plain, deep = verifier.image, verifier.depth
-        if self.input == "mask":
-            plain = verifier.mask
-        elif found.learned:
-            plain, deep = verifier.image_learned, verifier.depth_learned
-        known = np.isfinite(found.middle)
+        plain = verifier.mask if self.input == "mask" else verifier.image
+        weights = np.stack([plain, verifier.depth, verifier.image_learned, verifier.depth_learned])
+        # Where no circle of the other detector lies, it has nothing to say.
+        asked = found.table[:, NAMES.index(LEARNED)] > 0
+        model = (np.isfinite(found.middle) + 2 * asked).astype(np.int32)
         return decide(
-            found.edges, found.shapes, found.hits, found.table, known, plain, deep,
-            self.min_score,
-        )  # fmt: skip
+            found.edges, found.shapes, found.hits, found.table, model, weights, self.min_score
+        )
 
     def _load(self) -> Verifier:
         if self._verifier is None:

@@ -42,3 +42,13 @@ def test_circles_above_change_nothing_unless_asked_for() -> None:
     beside = PhaseHough().process(frame, mask, circles((80, 20, 12, 1.0)))
     assert np.array_equal(alone.center, beside.center)
     assert np.array_equal(alone.score, beside.score)
+
+
+def test_where_no_circle_lies_the_other_detector_has_nothing_to_say() -> None:
+    image = discs([(40, 60, 20), (110, 60, 15)], 0.8, 0.1)
+    frame, mask = frame_of(image), Mask(image > 0.5)
+    alone = PhaseHough().process(frame, mask)
+    asked = PhaseHough(use_learned=True).process(frame, mask, circles())
+    assert len(alone) == 2
+    assert np.array_equal(alone.center, asked.center)
+    assert np.array_equal(alone.score, asked.score)

@@ -23,7 +23,6 @@ from training.net.scenes import varied_cases
 from training.scenes import judging_cases
 from training.verifier import NET, RADII, segmentations
 
-
 CLASSIC = {
     "image": PhaseHough(radius_px=RADII, use_depth=False),
     "depth": PhaseHough(radius_px=RADII),
