@@ -22,8 +22,8 @@ from mushpipe.core.types import RgbdFrame
 logger = logging.getLogger("mushpipe")
 Progress = Callable[[RunReport], None]
 SOURCE_PATIENCE_S = 5.0
-# One more than two cores: one of them often waits for the slowest stage.
-FRAMES_AT_ONCE = 3
+# A third one made picks older and no more of them, on two cores.
+FRAMES_AT_ONCE = 2
 
 
 def run(
