@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 
 from mushpipe import Circles, Mask, RgbdFrame
+from mushpipe.evaluate.matching import circle_iou
 from mushpipe.sources.mcap import McapSource
 from mushpipe.stages.phase_hough import PhaseHough
-from training.matching import IOU, Floats, circle_iou
+from training.matching import IOU, Floats
 from training.verifier import segmentations
 
 RANGES: dict[str, dict[str, Any]] = {

@@ -10,23 +10,10 @@ from scipy.optimize import linear_sum_assignment
 
 from mushpipe import Circles
 from mushpipe.core.truth import Truth
+from mushpipe.evaluate.matching import circle_iou
 
 Floats = NDArray[np.float64]
 IOU = 0.5
-
-
-def circle_iou(center: Floats, radius: Floats, others: Floats, radii: Floats) -> Floats:
-    """Return the IoU (N, M) of circles with other circles."""
-    d = np.linalg.norm(center[:, None] - others[None], axis=2)
-    a, b = np.broadcast_arrays(radius[:, None], radii[None])
-    meets = (d < a + b) & (d > np.abs(a - b))
-    e = np.where(meets, d, 1.0)
-    first = a * a * np.arccos(np.clip((e * e + a * a - b * b) / (2 * e * a), -1, 1))
-    second = b * b * np.arccos(np.clip((e * e + b * b - a * a) / (2 * e * b), -1, 1))
-    kite = (a + b - e) * (e + a - b) * (e - a + b) * (e + a + b)
-    shared = np.where(meets, first + second - np.sqrt(np.maximum(kite, 0)) / 2, 0.0)
-    shared = np.where(d <= np.abs(a - b), np.pi * np.minimum(a, b) ** 2, shared)
-    return np.asarray(shared / (np.pi * (a * a + b * b) - shared))
 
 
 def counted(truth: Truth, smallest: float, largest: float) -> NDArray[np.bool_]:

@@ -19,6 +19,7 @@ from scipy.special import expit
 
 from mushpipe import Circles, Mask, RgbdFrame
 from mushpipe.core.truth import Ignore
+from mushpipe.evaluate.matching import circle_iou
 from mushpipe.stages.cap_net import CapNet
 from mushpipe.stages.chan_vese import ChanVese
 from mushpipe.stages.flatten import Flatten
@@ -28,7 +29,7 @@ from mushpipe.stages.phase_decide import LIMIT
 from mushpipe.stages.phase_features import DEPTH_FEATURES, IMAGE_FEATURES, LEARNED, NAMES
 from mushpipe.stages.phase_hough import PhaseHough, equal_area_radius
 from mushpipe.stages.verifier import COLUMNS
-from training.matching import IOU, circle_iou
+from training.matching import IOU
 from training.net.scenes import varied_cases
 from training.scenes import Case, training_cases
 

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 
 from mushpipe.core.jit import jit
-from mushpipe.stages.cap_linear import solve3, tukey
+from mushpipe.stages.cap_linear import tukey
 from mushpipe.stages.cap_model import HEIGHT, RADIUS, Floats, N
 from mushpipe.stages.cap_samples import COMPASS, DIRECTIONS
+from mushpipe.stages.linear import solve
 
 FROM, TO = 0.3, 2.2  # in radii of the circle: where the surface in it may end
 JUMP = 0.35  # in radii of the cap: its depth does not change so much from pixel to pixel
@@ -120,7 +121,7 @@ def regrow(
             n += 1
     if n < FEWEST:
         return False
-    step, matrix, off = np.zeros(3), np.empty((3, 3)), np.array([0.0, 0.0, circle[2]])
+    matrix, off = np.empty((3, 3)), np.array([0.0, 0.0, circle[2]])
     for k in range(ROUNDS):
         matrix[:] = np.diag(HELD)
         right = HELD * (np.array([0.0, 0.0, circle[2]]) - off)
@@ -134,9 +135,8 @@ def regrow(
                 right[a] += weight * row[a] * (far - off[2])
                 for b in range(3):
                     matrix[a, b] += weight * row[a] * row[b]
-        if not solve3(matrix, right, step):
-            return False
-        off += step
+        solve(matrix, right)
+        off += right
         off[2] = min(max(off[2], 0.6 * circle[2]), 2.0 * circle[2])
     out[0], out[1], out[2] = circle[0] + off[0], circle[1] + off[1], off[2]
     return True

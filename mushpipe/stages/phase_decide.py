@@ -127,6 +127,17 @@ def probability(row: Table, weights: Table) -> float:
 
 
 @jit
+def chance_beside(
+    edges: Edges, shape: Shape, hits: Rows, owner: Rows, accepted: Table, row: Table,
+    weights: Table,
+) -> float:  # fmt: skip
+    """Return the probability of a candidate beside the accepted; writes what depends on them."""
+    outline_features(edges, shape, hits, owner, accepted, row)
+    overlap_features(shape, accepted, row)
+    return probability(row, weights)
+
+
+@jit
 def _use_up(edges: Edges, shape: Shape, number: int, owner: Rows, rows: Rows) -> None:
     nothing = np.zeros((0, 0), np.float32)
     count = gather(edges, nothing, 0.0, shape, NARROW, 1, rows)
@@ -168,9 +179,9 @@ def decide(
     first, beside = neighbours(shapes)
     near = np.empty((n, 5))
     for k in range(n):
-        outline_features(edges, shapes[k], hits[k], owner, near[:0], table[k])
-        overlap_features(shapes[k], near[:0], table[k])
-        chance[k] = probability(table[k], weights[model[k]])
+        chance[k] = chance_beside(
+            edges, shapes[k], hits[k], owner, near[:0], table[k], weights[model[k]]
+        )
     for count in range(n):
         best, top = -1, least
         for k in range(n):
@@ -184,9 +195,9 @@ def decide(
         for k in beside[first[best] : first[best + 1]]:
             if waiting[k] and chance[k] > HOPELESS:
                 met = _accepted(shapes, waiting, beside[first[k] : first[k + 1]], near)
-                outline_features(edges, shapes[k], hits[k], owner, near[:met], table[k])
-                overlap_features(shapes[k], near[:met], table[k])
-                chance[k] = probability(table[k], weights[model[k]])
+                chance[k] = chance_beside(
+                    edges, shapes[k], hits[k], owner, near[:met], table[k], weights[model[k]]
+                )
     return order, chance, owner
 
 

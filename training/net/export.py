@@ -16,10 +16,11 @@ import torch
 from mushpipe import Circles, RgbdFrame
 from mushpipe.core.truth import Ignore
 from mushpipe.core.types import Header
+from mushpipe.evaluate.matching import circle_iou
 from mushpipe.stages.cap_decode import HEAT
 from mushpipe.stages.cap_net import KIND
 from mushpipe.stages.cap_net import CapNet as Stage
-from training.matching import IOU, circle_iou
+from training.matching import IOU
 from training.net.model import CapNet
 from training.net.scenes import VALIDATION, VALIDATION_SEED, Picture, pictures
 from training.verifier import Floats

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 
+from mushpipe import Circles, RgbdFrame
 from mushpipe.sources.mcap import McapSource
 from mushpipe.stages.cap_net import CapNet
 from mushpipe.stages.phase_hough import PhaseHough
@@ -48,8 +49,15 @@ def simulated(models: list[Path], cache: Path, peers: bool) -> str:
     return judge.table(scores, [*nets, *(CLASSIC if peers else ())])
 
 
+def both(frame: RgbdFrame, depth: bool) -> Circles:
+    """Return the circles of network and classic detector, as graphs/pick-net.yaml has them."""
+    net = CapNet(radius_px=(8, 60), min_score=0.05)
+    stage = PhaseHough(radius_px=(8, 80), use_learned=True, use_depth=depth)
+    return stage.process(frame, *net.process(frame))
+
+
 def real(model: Path, folder: Path) -> Iterator[str]:
-    """Yield a line per labelled frame of the recordings in a folder."""
+    """Yield lines per labelled frame of the recordings in a folder: the network, and both."""
     for path in sorted(folder.glob("*.mcap")):
         labels = json.loads(path.with_suffix(".labels.json").read_text())
         radius = next(v for k, v in RANGES.items() if path.stem.startswith(k))["radius_px"]
@@ -59,8 +67,11 @@ def real(model: Path, folder: Path) -> Iterator[str]:
         for frame in source.frames():
             wanted = labelled(labels, frame.header.stamp_ns)
             if wanted is not None:
-                text = result(net.process(frame)[1], *wanted)
-                yield f"{path.stem:18} #{frame.header.sequence} {text}"
+                name = f"{path.stem:18} #{frame.header.sequence}"
+                yield f"{name} cap-net      {result(net.process(frame)[1], *wanted)}"
+                yield f"{name} both, colour {result(both(frame, False), *wanted)}"
+                if frame.depth is not None:
+                    yield f"{name} both, depth  {result(both(frame, True), *wanted)}"
 
 
 def main() -> None:
