@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe import RgbdFrame
-from mushpipe.core.jit import jit
+from mushpipe.core.jit import inlined, jit
 from mushpipe.stages.bed import far_cells, fit_plane
 from mushpipe.stages.phase_edges import Edges, Plane, depth_edges
 
@@ -21,22 +21,37 @@ FILL = 8  # px of the height map: widest gap that is closed for edges
 STEEP = 1.0  # slope of an edge, height over length
 
 
-@jit
 def halved(depth: NDArray[Any], scale: float) -> Plane:
-    """Return the mean of the valid depths of each 2 x 2 px in metres, NaN where there is none."""
-    height, width = (depth.shape[0] + 1) // 2, (depth.shape[1] + 1) // 2
+    """Return the mean of the valid depths of each 2 x 2 px in metres, -1 where there is none."""
+    odd = depth.shape[0] % 2, depth.shape[1] % 2
+    if any(odd):  # a row that stands twice changes no mean
+        depth = np.pad(depth, ((0, odd[0]), (0, odd[1])), mode="edge")
+    return _halved(depth, scale)
+
+
+@inlined
+def _if_known(value: Any) -> Any:
+    """Return 1 for a depth, 0 where there is none: a comparison is false for NaN too."""
+    known = (value > np.float32(0)) & (value < np.float32(1e9))
+    return np.float32(1) if known else np.float32(0)
+
+
+@jit
+def _halved(depth: NDArray[Any], scale: float) -> Plane:
+    """Do the work of `halved` for an even size; without branches, so that SIMD does it."""
+    height, width = depth.shape[0] // 2, depth.shape[1] // 2
     out = np.empty((height, width), np.float32)
+    none, unit = np.float32(0), np.float32(scale)
     for y in range(height):
+        above, below = depth[2 * y], depth[2 * y + 1]
         for x in range(width):
-            total, count = np.float32(0), 0
-            for v in range(2 * y, min(2 * y + 2, depth.shape[0])):
-                for u in range(2 * x, min(2 * x + 2, depth.shape[1])):
-                    value = np.float32(depth[v, u])
-                    # a comparison is false for NaN too
-                    if value > 0 and value < np.float32(1e9):
-                        total += value
-                        count += 1
-            out[y, x] = total / count * np.float32(scale) if count else np.float32(-1)
+            a, b = np.float32(above[2 * x]), np.float32(above[2 * x + 1])
+            c, d = np.float32(below[2 * x]), np.float32(below[2 * x + 1])
+            i, j, k, n = _if_known(a), _if_known(b), _if_known(c), _if_known(d)
+            total = (a if i > none else none) + (b if j > none else none)
+            total += (c if k > none else none) + (d if n > none else none)
+            count = i + j + k + n
+            out[y, x] = total / count * unit if count > none else np.float32(-1)
     return out
 
 

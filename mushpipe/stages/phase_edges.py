@@ -186,15 +186,16 @@ def thin(
     """
     height, width = size.shape
     count = 0
-    half, ahead_of = np.float32(0.5), np.float32(1.1)
+    nearest, slope_on = np.float32(1.5), np.float32(1.1)
     for y in range(2, height - 2):
         for x in range(2, width - 2):
             m = size[y, x]
             if m <= threshold or region[y, x] == 0:
                 continue
             nx, ny = gx[y, x] / m, gy[y, x] / m
-            # most pixels lie on a slope that goes on: one look ahead spares the interpolation
-            if size[int(y + ny + half), int(x + nx + half)] > ahead_of * m:
+            # most pixels lie on a slope that goes on: a look at both sides spares the interpolation
+            i, j = int(nx + nearest) - 1, int(ny + nearest) - 1
+            if size[y + j, x + i] > slope_on * m or size[y - j, x - i] > slope_on * m:
                 continue
             ahead = _at(size, x + nx, y + ny)
             behind = _at(size, x - nx, y - ny)

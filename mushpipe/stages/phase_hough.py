@@ -25,7 +25,7 @@ from mushpipe.stages.phase_edges import (
 )
 from mushpipe.stages.phase_features import LEARNED, NAMES, static_features
 from mushpipe.stages.phase_fuse import fused
-from mushpipe.stages.phase_learned import agreement, candidates_of, discs_of
+from mushpipe.stages.phase_learned import add_discs, agreement, candidates_of
 from mushpipe.stages.phase_refit import Table, refit
 from mushpipe.stages.phase_votes import CELL, peaks, rings_between, summed, vote
 from mushpipe.stages.verifier import Verifier, load_verifier
@@ -145,7 +145,7 @@ class PhaseHough(Stage):
         gradient = gradient_of(image)
         foreground = _foreground(mask, relief)
         if learned is not None:
-            foreground = foreground | discs_of(learned, foreground.shape)
+            foreground = add_discs(learned, foreground)
         region = np.ones_like(foreground) if literal else cv2.dilate(foreground, _AROUND)
         edges = self._edges(image, gradient, np.asarray(region, np.uint8), relief)
         cells = vote(

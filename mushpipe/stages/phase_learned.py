@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import cv2
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe import Circles
-from mushpipe.evaluate.matching import circle_iou
+from mushpipe.core.jit import jit
+from mushpipe.stages.phase_decide import lens
 from mushpipe.stages.phase_edges import Plane
 from mushpipe.stages.phase_refit import Table
 
@@ -21,12 +23,11 @@ def candidates_of(learned: Circles, smallest: float, largest: float) -> Plane:
     return rows[within]
 
 
-def discs_of(learned: Circles, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """Return (H, W) 1 in the circles and a little around them: there edges are looked for."""
-    discs = np.zeros(shape, np.uint8)
-    for (x, y), radius in zip(learned.center, learned.radius, strict=True):
-        cv2.circle(discs, (round(x), round(y)), round(radius + _AROUND), 1, -1)
-    return discs
+def add_discs(learned: Circles, foreground: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return a foreground (H, W) with 1 in the circles and a little around them as well."""
+    added = foreground.copy()
+    _fill(added, learned.center, learned.radius)
+    return added
 
 
 def agreement(shapes: Table, radius: Table, learned: Circles) -> Table:
@@ -34,5 +35,29 @@ def agreement(shapes: Table, radius: Table, learned: Circles) -> Table:
 
     The largest score of a circle, times its IoU with the outline's circle.
     """
-    iou = circle_iou(shapes[:, :2], radius, learned.center, learned.radius)
-    return np.asarray((iou * learned.score).max(axis=1, initial=0.0))
+    return _agreement(shapes, radius, learned.center, learned.radius, learned.score)
+
+
+@jit
+def _fill(foreground: NDArray[np.uint8], center: Table, radius: Table) -> None:
+    height, width = foreground.shape
+    for k in range(len(center)):
+        x, y, reach = center[k, 0], center[k, 1], radius[k] + _AROUND
+        for v in range(max(0, math.ceil(y - reach)), min(height, math.floor(y + reach) + 1)):
+            half = math.sqrt(reach * reach - (v - y) ** 2)
+            for u in range(max(0, math.ceil(x - half)), min(width, math.floor(x + half) + 1)):
+                foreground[v, u] = 1
+
+
+@jit
+def _agreement(shapes: Table, radius: Table, center: Table, of: Table, score: Table) -> Table:
+    best = np.zeros(len(shapes))
+    for k in range(len(shapes)):
+        for m in range(len(center)):
+            dx, dy = shapes[k, 0] - center[m, 0], shapes[k, 1] - center[m, 1]
+            squared = dx * dx + dy * dy
+            if squared < (radius[k] + of[m]) ** 2:
+                shared = lens(math.sqrt(squared), radius[k], of[m])
+                total = math.pi * (radius[k] ** 2 + of[m] ** 2)
+                best[k] = max(best[k], score[m] * shared / (total - shared))
+    return best
