@@ -1,7 +1,9 @@
 """The stages of a plan, through which frames follow one another.
 
 A frame may enter a stage as soon as the frame before it has left that stage: every stage sees all
-frames, in order and one at a time, so what comes out is what a single thread would have made.
+frames, in order and one at a time, so what comes out is what a single thread would have made. Only
+a stage that says it is reentrant may have several frames in it; they leave in order all the same,
+since the next one takes them in order.
 """
 
 from __future__ import annotations
@@ -11,13 +13,14 @@ import threading
 import time
 import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from mushpipe.core.plan import Link, Node, Plan
+from mushpipe.core.stage import Stage
 from mushpipe.core.types import Mask, RgbdFrame, Trace
 
 Outputs = dict[str, tuple[Any, ...]]
@@ -76,19 +79,19 @@ class Chain:
     def __init__(self, plan: Plan) -> None:
         self.plan = plan
         self.closed = False
-        self._turnstiles = [Turnstile() for _ in plan.stages]
+        self._turnstiles = [None if _reentrant(node) else Turnstile() for node in plan.stages]
 
     def await_first(self, ticket: int) -> None:
         """Wait until the first stage is free for a ticket."""
-        for turnstile in self._turnstiles[:1]:
-            turnstile.wait(ticket)
+        if self._turnstiles and (first := self._turnstiles[0]):
+            first.wait(ticket)
 
     def passed(self, frame: RgbdFrame, ticket: int) -> Passage:
         """Take a frame through the stages, up to the one that fails, and return what they did."""
         seen = replace(frame, attached={})
         passage = Passage(frame, {self.plan.source.name: (seen,)})
         for node, turnstile in zip(self.plan.stages, self._turnstiles, strict=True):
-            with turnstile.turn(ticket):
+            with turnstile.turn(ticket) if turnstile else nullcontext():
                 if passage.failed is None and not self.closed:
                     self._step(node, passage)
         return passage
@@ -96,7 +99,7 @@ class Chain:
     def close(self) -> None:
         """Let what is on its way pass without calling stages: nobody will look at it."""
         self.closed = True
-        for turnstile in self._turnstiles:
+        for turnstile in filter(None, self._turnstiles):
             turnstile.open()
 
     def _step(self, node: Node, passage: Passage) -> None:
@@ -139,6 +142,10 @@ def cores_shared() -> Iterator[None]:
     finally:
         sys.setswitchinterval(interval)
         cv2.setNumThreads(helpers)
+
+
+def _reentrant(node: Node) -> bool:
+    return isinstance(node.plugin, Stage) and node.plugin.reentrant
 
 
 def sink_inputs(node: Node, trace: Trace) -> dict[str, Any]:

@@ -77,7 +77,13 @@ class Stage(Plugin):
     """One step of the pipeline; subclasses add ``process``, whose signature is their ports.
 
     It is called for all frames in order and one at a time, but not always from the same thread.
+
+    Attributes:
+        reentrant: Says that ``process`` depends on its arguments alone and may be in work in
+            several threads at once; then it may see the next frame before it is done with one.
     """
+
+    reentrant: ClassVar[bool] = False
 
     def open(self) -> None:
         """Load weights, compile kernels: once per run, before the first frame."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import cv2
 import numpy as np
@@ -71,6 +71,8 @@ class PhaseHough(Stage):
     cap, in the order of its probability. The score is that probability. Circles have the area of
     the outline, so a tilted cap's is between its long and its short axis.
     """
+
+    reentrant: ClassVar[bool] = True
 
     input: Literal["image", "mask"] = Field(
         "image", description="where edges are taken from; `mask` is the paper's variant, no depth"

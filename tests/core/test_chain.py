@@ -77,6 +77,42 @@ def test_each_stage_sees_all_frames_in_order_and_one_at_a_time(lab: Lab) -> None
     assert [trace.frame.header.sequence for trace in lab.seen] == list(range(50))
 
 
+def test_a_reentrant_stage_has_two_frames_in_it_and_the_next_stage_sees_them_in_order(
+    lab: Lab,
+) -> None:
+    both, calls = threading.Barrier(2, timeout=20), []
+
+    class Meets(Stage):
+        reentrant = True
+
+        def process(self, frame: RgbdFrame) -> Mask:
+            both.wait()  # breaks where one of two frames is kept out
+            time.sleep(0.003 * (frame.header.sequence % 2 == 0))  # the later one is done first
+            return Mask(frame.color[..., 0] > 0)
+
+    class After(Stage):
+        def process(self, frame: RgbdFrame, mask: Mask) -> Circles:
+            calls.append(frame.header.sequence)
+            return circles(1)
+
+    report = lab.run(lab.chain(Meets, After), "source.count=10")
+    assert (report.processed, report.error) == (10, None)
+    assert calls == list(range(10))
+    assert [trace.frame.header.sequence for trace in lab.seen] == calls
+
+
+def test_frames_leave_in_order_where_the_last_stage_is_reentrant(lab: Lab) -> None:
+    class Last(Stage):
+        reentrant = True
+
+        def process(self, frame: RgbdFrame) -> Circles:
+            time.sleep(random.random() / 500)
+            return circles(1)
+
+    assert lab.run(lab.chain(Last), "source.count=30").processed == 30
+    assert [trace.frame.header.sequence for trace in lab.seen] == list(range(30))
+
+
 def test_a_later_frame_that_fails_first_does_not_count_before_its_turn(lab: Lab, tmp_path) -> None:
     later_failed = threading.Event()
 
