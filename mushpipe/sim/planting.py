@@ -99,6 +99,9 @@ def _seat(settings: SceneSettings, area: Area, share: float, rng: np.random.Gene
             height[row] = rng.uniform(0.004, 0.014)
         elif k == Kind.FALLEN:
             height[row] = 0.8 * radius[row]
+        elif k == Kind.GROWING and settings.sunk:
+            deep = generator(settings.seed, "sunk", row).uniform(0, settings.sunk)
+            height[row] *= 1 - deep
     return _Seats(kind, radius, place, height, np.zeros_like(place))
 
 

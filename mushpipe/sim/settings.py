@@ -42,6 +42,9 @@ class SceneSettings(BaseModel):
     stumps: int = Field(1, ge=0, le=40, description="stems left by a cut, in view, about")
     fallen: int = Field(0, ge=0, le=40, description="caps lying on their side, in view, about")
     lean: float = Field(0, ge=0, le=1, description="how far stems lean and show beside their caps")
+    sunk: float = Field(
+        0, ge=0, le=1, description="how deep mushrooms stand in the soil; 1: some up to the rim"
+    )
     deform: float = Field(
         0, ge=0, le=1, description="departure of caps from their family; 0: as the family has it"
     )

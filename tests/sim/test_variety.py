@@ -66,6 +66,21 @@ def test_leaning_stems_stand_farther_out_under_the_same_caps() -> None:
     assert max(moved) > 0.7
 
 
+def test_sunk_mushrooms_are_the_same_ones_lower_in_the_soil() -> None:
+    plain, sunk = world(cluster=0.0), world(cluster=0.0, sunk=1.0)
+    share = []
+    for a, b in zip(plain.mushrooms, sunk.mushrooms, strict=True):
+        assert (a.kind, a.radius, a.shape) == (b.kind, b.radius, b.shape)
+        high, low = (m.center[2] - m.foot[2] for m in (a, b))
+        assert 0 <= low <= high + 1e-9
+        if a.kind == Kind.GROWING:
+            share.append(low / high)
+        else:
+            assert low == pytest.approx(high)
+    assert min(share) < 0.15
+    assert max(share) > 0.7
+
+
 def test_a_deformed_cap_keeps_its_family_and_its_rim_plane() -> None:
     rng = np.random.default_rng(4)
     for _ in range(50):
