@@ -2,7 +2,7 @@
 
     python benchmarks/localization.py --family b --seeds 5000:5003
 
-The circles are those of `graphs/pick.yaml`, paired with the truth by the rules of `mushpipe eval`.
+The circles are those of `graphs/classic.yaml`, paired with the truth as `mushpipe eval` does.
 Errors in mm; z2 is the mean of (error / stated sigma)^2. `seen`: nothing hides the centre;
 `holes`: there is no depth at it.
 """
@@ -32,7 +32,7 @@ from mushpipe.stages.nearest_depth import NearestDepth
 from mushpipe.stages.picks import MakePicks
 from mushpipe.stages.surface_fit import SurfaceFit
 
-GRAPH = Path(__file__).parents[1] / "graphs" / "pick.yaml"
+GRAPH = Path(__file__).parents[1] / "graphs" / "classic.yaml"
 MOVING = {"distance": 0.5, "size_mm": (20, 55), "count": 70, "step_mm": 15, "travel_mm": 60,
           "fps": 10}  # fmt: skip
 TIMED = {"distance": 0.65, "size_mm": (20, 50), "tilt_deg": (0, 25), "count": 240, "cluster": 0.5}

@@ -64,7 +64,7 @@ def truth_of(frame: RgbdFrame) -> Truth:
 
 @lru_cache
 def detector() -> tuple[Flatten, ChanVese, Opening, PhaseHough]:
-    """Return the stages of `graphs/pick.yaml` that find circles, for caps of any size."""
+    """Return the stages of `graphs/classic.yaml` that find circles, for caps of any size."""
     stages = Flatten(), ChanVese(channel="auto"), Opening(size=10), PhaseHough(radius_px=None)
     for stage in stages:
         stage.open()

@@ -18,7 +18,7 @@ def run(use: str, tmp_path: Path, **environment: str) -> subprocess.CompletedPro
     overrides = [text for key, value in settings.items() for text in ("--set", f"{key}={value}")]
     code = "from mushpipe.cli import main; main()"
     return subprocess.run(
-        [sys.executable, "-c", code, "run", "graphs/pick.yaml", "--frames", "1", *overrides],
+        [sys.executable, "-c", code, "run", "graphs/classic.yaml", "--frames", "1", *overrides],
         cwd=ROOT,
         env={**os.environ, **environment},
         capture_output=True,

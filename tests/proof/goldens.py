@@ -29,6 +29,7 @@ FOLDER = ROOT / "goldens"
 TOLERANCE = 1e-3
 GRAPHS = {
     "pick": ROOT / "graphs/pick.yaml",
+    "classic": ROOT / "graphs/classic.yaml",
     "baisa2022": ROOT / "graphs/baisa2022.yaml",
     "every": ROOT / "tests/proof/every.yaml",
 }
@@ -70,6 +71,7 @@ class Case:
 
 CASES = [
     *(Case("pick", recording, 2) for recording in RECORDINGS),
+    *(Case("classic", recording, 1) for recording in ("first-bed", "gaps", "harsh-light", "lab")),
     Case("baisa2022", "first-bed", 1),
     Case("every", "first-bed", 2),
 ]

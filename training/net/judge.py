@@ -50,7 +50,7 @@ def simulated(models: list[Path], cache: Path, peers: bool) -> str:
 
 
 def both(frame: RgbdFrame, depth: bool) -> Circles:
-    """Return the circles of network and classic detector, as graphs/pick-net.yaml has them."""
+    """Return the circles of network and classic detector, as graphs/pick.yaml has them."""
     net = CapNet(radius_px=(8, 60), min_score=0.05)
     stage = PhaseHough(radius_px=(8, 80), use_learned=True, use_depth=depth)
     return stage.process(frame, *net.process(frame))
