@@ -42,6 +42,7 @@ CONDITIONS: dict[str, dict[str, Any]] = {
         "tilt_deg": (0, 30),
     },
     "low": {"sunk": 1, "relief_mm": 4, "rubble": 40},
+    "lids": {"lids": 15, "relief_mm": 2, "count": 60},
 }
 
 # How many frames of each condition a training run takes, seeds from 0 on.
@@ -49,15 +50,15 @@ TRAINING = {
     "even": 8, "gradient": 5, "dense": 8, "brown": 6, "tilted": 8, "mixed": 4, "cream": 2,
     "side": 3, "spot": 2, "harsh": 4, "near": 4, "far": 3, "oblique": 4, "lab": 4, "cloth": 2,
     "paint": 2, "empty": 3, "bare": 3, "fallen": 6, "wood": 6,
-    "low": 8,
+    "low": 8, "lids": 6,
 }  # fmt: skip
 CHOOSING = {
     "even": 3, "gradient": 3, "dense": 3, "brown": 3, "tilted": 4, "harsh": 2, "near": 1,
     "oblique": 1, "lab": 2, "empty": 1, "bare": 1, "fallen": 2, "wood": 2,
-    "low": 3,
+    "low": 3, "lids": 2,
 }  # fmt: skip
 JUDGED = ("even", "gradient", "dense", "brown", "tilted", "side", "harsh", "lab", "empty", "bare",
-          "fallen", "wood", "low")  # fmt: skip
+          "fallen", "wood", "low", "lids")  # fmt: skip
 CHOOSING_SEED, JUDGING_SEED = 900, 5000
 
 

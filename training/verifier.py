@@ -26,7 +26,13 @@ from mushpipe.stages.flatten import Flatten
 from mushpipe.stages.opening import Opening
 from mushpipe.stages.otsu import Otsu
 from mushpipe.stages.phase_decide import LIMIT
-from mushpipe.stages.phase_features import DEPTH_FEATURES, IMAGE_FEATURES, LEARNED, NAMES
+from mushpipe.stages.phase_features import (
+    DEPTH_FEATURES,
+    IMAGE_FEATURES,
+    LEARNED,
+    NAMES,
+    kinds,
+)
 from mushpipe.stages.phase_hough import PhaseHough, equal_area_radius
 from mushpipe.stages.verifier import COLUMNS
 from training.matching import IOU
@@ -41,17 +47,22 @@ BETTER = 0.15  # of IoU; less gained nothing on scenes that chose nothing
 NET = CapNet(radius_px=RADII, min_score=0.05)  # what it is unsure of is for the verifier to decide
 MODELS: dict[str, dict[str, Any]] = {
     "image": {"use_depth": False},
-    "depth": {"use_depth": True},
+    "depth": {},
+    "low": {},
     "mask": {"input": "mask"},
     "image_learned": {"use_depth": False},
-    "depth_learned": {"use_depth": True},
+    "depth_learned": {},
+    "low_learned": {},
 }
+KINDS = {"depth": 1, "low": 2}  # of `phase_features.kinds`; the others are 0
 FEATURES = {
     "image": tuple(IMAGE_FEATURES),
     "depth": (*IMAGE_FEATURES, *DEPTH_FEATURES),
+    "low": (*IMAGE_FEATURES, *DEPTH_FEATURES),
     "mask": tuple(name for name in IMAGE_FEATURES if name not in ("cover", "texture")),
     "image_learned": (*IMAGE_FEATURES, LEARNED),
     "depth_learned": NAMES,
+    "low_learned": NAMES,
 }
 # An ignored mushroom of these kinds is a cap all the same, or is surely none.
 RIGHT, WRONG = (Ignore.AT_BORDER, Ignore.TOO_LARGE), (Ignore.CUT_STUMP,)
@@ -113,8 +124,11 @@ def labels(case: Case, circles: Circles, order: NDArray[np.intp]) -> Floats:
     return result
 
 
-def samples(stage: PhaseHough, cases: Iterable[Prepared], depth: bool) -> tuple[Floats, Floats]:
-    """Return features (N, F) and labels (N,) of all candidates of a pass over the scenes."""
+def samples(stage: PhaseHough, cases: Iterable[Prepared], kind: int) -> tuple[Floats, Floats]:
+    """Return features (N, F) and labels (N,) of all candidates of a kind in a pass over the scenes.
+
+    The kind is that of `phase_features.kinds`.
+    """
     rows, right = [np.zeros((0, len(NAMES)))], [np.zeros(0)]
     for case, frame, mask, learned in cases:
         found = stage.gather(frame, mask, learned)
@@ -123,7 +137,7 @@ def samples(stage: PhaseHough, cases: Iterable[Prepared], depth: bool) -> tuple[
         order, chance, _ = stage.decide(found)
         circles = Circles(found.shapes[:, :2], equal_area_radius(found.shapes), chance)
         label = labels(case, circles, order)
-        use = np.isfinite(label) & (np.isfinite(found.middle) if depth else True)
+        use = np.isfinite(label) & (kinds(found.table, found.middle) == kind)
         rows.append(found.table[use])
         right.append(label[use])
     return np.concatenate(rows), np.concatenate(right)
@@ -184,7 +198,8 @@ def train(cache: Path, out: Path, rounds: int, ridge: float, names: list[str]) -
             stage = PhaseHough(radius_px=RADII, verifier=out, **MODELS[name])
             beside = name.endswith("learned")
             chosen = [case for case in cases if (case[3] is not None) == beside]
-            features, right = samples(stage, chosen, name.startswith("depth"))
+            kind = KINDS.get(name.removesuffix("_learned"), 0)
+            features, right = samples(stage, chosen, kind)
             models[name] = fit(features, right, FEATURES[name], ridge)
             print(f"round {turn + 1}, {name}: {len(right)} candidates, {right.mean():.2f} right")
         write(models, out)

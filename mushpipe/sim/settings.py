@@ -61,6 +61,7 @@ class SceneSettings(BaseModel):
         0, ge=0, le=300, description="clods and stones as large as caps, in view, about"
     )
     foreign: int = Field(0, ge=0, le=20, description="papers, boxes, cups and rails on the bed")
+    lids: int = Field(0, ge=0, le=60, description="round lids and paper discs that lie flat")
     tray: bool = Field(False, description="show the rim of the tray at the left")
     table: Literal["wood", "cloth", "paint"] = Field("wood", description="table of the lab scene")
     clutter: int = Field(4, ge=0, le=20, description="papers, boxes and cups on the lab's table")

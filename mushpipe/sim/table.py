@@ -120,6 +120,21 @@ def foreign(
     return things
 
 
+def lids(
+    count: int, area: Area, ground: Callable[[Floats], Floats], rng: np.random.Generator
+) -> list[Mesh]:
+    """Return lids and paper discs of 10 to 60 mm on a ground of a height (N,) m at (N, 2) m."""
+    things = []
+    for _ in range(count):
+        radius, thick = rng.uniform(0.005, 0.03), rng.uniform(0.0003, 0.002)
+        profile = np.array([0, 0.9, 0.97, 1.0]) * radius, np.array([1, 1, 0.9, 0.0]) * thick
+        kind = (Material.PAPER, Material.PLASTIC)[rng.integers(2)]
+        spot = area.draw(rng, 1)[0]
+        place = np.array([*spot, float(ground(spot[None])[0]) + 0.002])
+        things.append(sheet(revolve(*profile, 48), kind).placed(np.eye(3), place))
+    return things
+
+
 def _rail(area: Area, rng: np.random.Generator) -> Mesh:
     """A bar of metal or plastic across the whole view, on the bed or above it."""
     kind = (Material.METAL, Material.PLASTIC)[rng.integers(2)]

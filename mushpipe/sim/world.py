@@ -142,6 +142,8 @@ def _things(
     floor = box((20.0, 20.0, 0.01), Material.FLOOR)
     things = [floor.placed(np.eye(3), np.array([0.0, 0.0, -0.8]))]
     feet = np.array([m.foot[:2] for m in mushrooms]).reshape(-1, 2)
+    flat = generator(settings.seed, "lids")
+    things += tables.lids(settings.lids, view, base.height_at, flat)
     if settings.scene == "lab":
         return things + tables.clutter(settings.clutter, view, feet, rng)
     if settings.scene == "bed":

@@ -23,7 +23,7 @@ from mushpipe.stages.phase_edges import (
     gradient_of,
     otsu_of,
 )
-from mushpipe.stages.phase_features import LEARNED, NAMES, static_features
+from mushpipe.stages.phase_features import LEARNED, NAMES, kinds, static_features
 from mushpipe.stages.phase_fuse import fused
 from mushpipe.stages.phase_learned import add_discs, agreement, candidates_of
 from mushpipe.stages.phase_refit import Table, refit
@@ -170,10 +170,11 @@ class PhaseHough(Stage):
         """Return the accepted rows in their order, all probabilities, and whose each edge is."""
         verifier = self._load()
         plain = verifier.mask if self.input == "mask" else verifier.image
-        weights = np.stack([plain, verifier.depth, verifier.image_learned, verifier.depth_learned])
+        beside = verifier.image_learned, verifier.depth_learned, verifier.low_learned
+        weights = np.stack([plain, verifier.depth, verifier.low, *beside])
         # Where no circle of the other detector lies, it has nothing to say.
-        asked = found.table[:, NAMES.index(LEARNED)] > 0
-        model = (np.isfinite(found.middle) + 2 * asked).astype(np.int32)
+        asked = (found.table[:, NAMES.index(LEARNED)] > 0).astype(np.int32)
+        model = kinds(found.table, found.middle) + 3 * asked
         return decide(
             found.edges, found.shapes, found.hits, found.table, model, weights, self.min_score
         )

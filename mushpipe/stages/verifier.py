@@ -22,9 +22,10 @@ COLUMNS = ("mean", "scale", "weight", "square")
 
 @dataclass(frozen=True, eq=False)
 class Verifier:
-    """Weights of the models ``image``, ``depth`` and ``mask``, each (F + 1, 4).
+    """Weights of models, each (F + 1, 4).
 
-    ``image_learned`` and ``depth_learned`` are for candidates beside another detector's circles.
+    ``image`` and ``mask`` are for candidates without depth, ``depth`` for those with, ``low`` for
+    those that hardly stand out from the bed; ``.._learned`` beside another detector's circles.
 
     Row k holds mean, scale, weight and weight of the square of feature k, the last row the
     intercept as its weight. A feature that a model does not name has no weight in it.
@@ -32,9 +33,11 @@ class Verifier:
 
     image: Table
     depth: Table
+    low: Table
     mask: Table
     image_learned: Table
     depth_learned: Table
+    low_learned: Table
 
 
 def load_verifier(path: Path | None = None) -> Verifier:

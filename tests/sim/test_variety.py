@@ -81,6 +81,14 @@ def test_sunk_mushrooms_are_the_same_ones_lower_in_the_soil() -> None:
     assert max(share) > 0.7
 
 
+def test_lids_lie_flat_and_change_nothing_else() -> None:
+    plain, strewn = world(), world(lids=9)
+    added = len(strewn.triangles) - len(plain.triangles)
+    assert added > 9 * 48
+    for a, b in zip(plain.mushrooms, strewn.mushrooms, strict=True):
+        assert np.array_equal(a.center, b.center)
+
+
 def test_a_deformed_cap_keeps_its_family_and_its_rim_plane() -> None:
     rng = np.random.default_rng(4)
     for _ in range(50):

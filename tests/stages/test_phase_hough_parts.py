@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +16,13 @@ from mushpipe.stages.phase_features import (
     DEPTH_FEATURES,
     IMAGE_FEATURES,
     NAMES,
+    kinds,
     static_features,
 )
 from mushpipe.stages.phase_hough import PhaseHough, equal_area_radius
 from mushpipe.stages.phase_refit import DIRECTIONS, HIDDEN, directions_of
 from mushpipe.stages.phase_votes import GAP, peaks, phase_of, rings_between, summed, vote
-from mushpipe.stages.verifier import load_verifier, weights_of
+from mushpipe.stages.verifier import Verifier, load_verifier, weights_of
 from tests.stages.scenes import discs, frame_of, sphere_depth
 
 ALL = np.ones((120, 160), np.uint8)
@@ -251,15 +253,23 @@ def test_the_verifier_of_the_package_names_known_features_only() -> None:
     first_depth = len(IMAGE_FEATURES)
     for weights in (verifier.image, verifier.mask):
         assert not weights[first_depth:-1, 2:].any()
-    assert verifier.depth[first_depth:-1, 2:].any()
-    assert np.isfinite(verifier.depth).all()
-    assert (verifier.depth[:, 1] > 0).all()
+    for weights in (verifier.depth, verifier.low):
+        assert weights[first_depth:-1, 2:].any()
+        assert np.isfinite(weights).all()
+        assert (weights[:, 1] > 0).all()
+
+
+def test_candidates_are_of_a_kind_by_what_depth_says_of_them() -> None:
+    table, middle = np.zeros((4, len(NAMES))), np.array([np.nan, 0.04, 0.02, -0.01])
+    # h / (|h| + R) of R = 20 mm
+    table[:, NAMES.index("height")] = [0.0, 0.04 / 0.06, 0.02 / 0.04, -0.01 / 0.03]
+    assert kinds(table, middle).tolist() == [0, 1, 2, 2]
 
 
 def test_a_verifier_with_an_unknown_feature_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "verifier.yaml"
     model = "{intercept: 0, features: {luck: {mean: 0, scale: 1, weight: 1, square: 0}}}"
-    names = ("image", "depth", "mask", "image_learned", "depth_learned")
+    names = [field.name for field in fields(Verifier)]
     path.write_text(f"models: {{{', '.join(f'{name}: {model}' for name in names)}}}")
     with pytest.raises(ValueError, match="unknown features"):
         load_verifier(path)
