@@ -10,6 +10,7 @@ The exponent is the slope of log(time) over log(size): 1 is linear.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 from typing import cast
@@ -18,7 +19,7 @@ import matplotlib as mpl
 import numpy as np
 
 from mushpipe import Source, Stage
-from mushpipe.core.chain import Chain
+from mushpipe.core.chain import Chain, cores_shared
 from mushpipe.core.document import read_document
 from mushpipe.core.graph import compile_document
 from mushpipe.core.plugins import load_registry
@@ -46,17 +47,24 @@ def recording(folder: Path, **scene: int) -> Path:
 
 
 def measure(folder: Path, frames: int, **scene: int) -> dict[str, float]:
-    """Return the median time of each stage on one frame of a scene, without sinks, ms."""
+    """Return the median time of each stage on one frame of a scene, ms."""
     largest = 45 * scene.get("width", 640) / 640
     radii = f"detect.radius_px=[{max(5, largest / 6)},{largest}]"
-    path = str(recording(folder, **scene))
-    plan = compile_document(read_document(GRAPH), load_registry(), [radii], path).fresh()
+    return stage_times(GRAPH, recording(folder, **scene), frames, [radii])
+
+
+def stage_times(
+    graph: Path, path: Path, frames: int, overrides: Sequence[str] = ()
+) -> dict[str, float]:
+    """Return the median time of each stage, of passes of one frame one by one, ms."""
+    plan = compile_document(read_document(graph), load_registry(), overrides, str(path)).fresh()
     source = cast(Source, plan.source.plugin)
     frame = next(source.frames())
     for node in plan.stages:
         cast(Stage, node.plugin).open()
     chain = Chain(plan)
-    times = [chain.passed(frame, ticket).durations_ns for ticket in range(frames)]
+    with cores_shared():
+        times = [chain.passed(frame, ticket).durations_ns for ticket in range(frames)]
     medians = {name: median(row[name] for row in times) / 1e6 for name in times[0]}
     return {**medians, "all stages": median(sum(row.values()) for row in times) / 1e6}
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 
-from mushpipe import Circles, GraphPath, Mask, RgbdFrame, Stage
+from mushpipe import Circles, GraphPath, Header, Mask, RgbdFrame, Stage
 from mushpipe.core.errors import UsageError
 from mushpipe.core.onnx_file import OnnxFile
 from mushpipe.stages.cap_decode import (
@@ -57,16 +57,17 @@ class CapNet(Stage):
         return self
 
     def open(self) -> None:
-        """Read the model; raises as `_load` does."""
-        self._load()
-
-    def _load(self) -> OnnxFile:
-        """Return the model.
+        """Read the model and run it once, for the first image takes several times as long.
 
         Raises:
-            UsageError: It is missing, damaged, or not one that `make train` wrote.
+            UsageError: The model is missing, damaged, or not one that `make train` wrote.
             DependencyError: ONNX Runtime is not installed.
         """
+        color = np.zeros((480, 640, 3), np.uint8)
+        self.process(RgbdFrame(Header(0, 0, "warm-up"), color))
+
+    def _load(self) -> OnnxFile:
+        """Return the model; raises as `open` does."""
         if self._net is not None:
             return self._net
         path = self.model or Path(str(resources.files("mushpipe.stages") / FILE))
