@@ -172,6 +172,7 @@ def _targets(table: _Table, rows: NDArray[np.intp]) -> tuple[Target, ...]:
     diameter = np.round(table.diameter, 6).tolist()
     score = np.round(table.score, 4).tolist()
     spread = np.round(table.sigma_position, 6).tolist()
+    unsure = np.isnan(table.sigma_position).any(axis=1).tolist()
     size_spread = np.round(table.sigma_diameter, 6).tolist()
     tilt = np.round(table.sigma_tilt, 6).tolist()
     found = []
@@ -187,7 +188,7 @@ def _targets(table: _Table, rows: NDArray[np.intp]) -> tuple[Target, ...]:
             "diameter": diameter[i],
             "score": score[i],
             "sigma": {
-                "position": None if np.isnan(spread[i]).any() else spread[i],
+                "position": None if unsure[i] else spread[i],
                 "diameter": size_spread[i],
                 "tilt": tilt[i],
             },
