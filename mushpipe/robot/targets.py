@@ -172,7 +172,7 @@ def _targets(table: _Table, rows: NDArray[np.intp]) -> tuple[Target, ...]:
     diameter = np.round(table.diameter, 6).tolist()
     score = np.round(table.score, 4).tolist()
     spread = np.round(table.sigma_position, 6).tolist()
-    unsure = np.isnan(table.sigma_position).any(axis=1).tolist()
+    unsure = np.asarray(np.isnan(table.sigma_position).any(axis=1))
     size_spread = np.round(table.sigma_diameter, 6).tolist()
     tilt = np.round(table.sigma_tilt, 6).tolist()
     found = []
