@@ -5,7 +5,7 @@ import pytest
 
 from mushpipe import Circles, InputError, Mask
 from mushpipe.stages.phase_hough import PhaseHough
-from mushpipe.stages.phase_learned import agreement, candidates_of
+from mushpipe.stages.phase_learned import add_discs, agreement, candidates_of
 from tests.stages.scenes import discs, frame_of
 
 
@@ -26,6 +26,18 @@ def test_agreement_is_score_times_shared_area() -> None:
 def test_candidates_are_the_circles_of_the_range() -> None:
     learned = circles((50, 40, 7, 0.9), (60, 41, 20, 0.3), (70, 42, 50, 0.9))
     assert candidates_of(learned, 8, 45) == pytest.approx(np.array([[60, 41, 20, 0.3]]))
+
+
+def test_discs_are_added_to_the_foreground_also_across_the_border() -> None:
+    before = np.zeros((60, 80), np.uint8)
+    before[0, 0] = 1
+    learned = circles((20.3, 30.6, 9, 1.0), (78, 2, 6, 0.1), (-3, 58, 8, 0.5))
+    v, u = np.mgrid[:60, :80]
+    wanted = before > 0
+    for (x, y), radius in zip(learned.center, learned.radius, strict=True):
+        wanted = wanted | ((u - x) ** 2 + (v - y) ** 2 <= (radius + 4) ** 2)
+    assert np.array_equal(add_discs(learned, before), wanted)
+    assert before.sum() == 1
 
 
 def test_without_circles_use_learned_says_what_is_missing() -> None:
