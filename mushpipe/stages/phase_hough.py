@@ -28,7 +28,7 @@ from mushpipe.stages.phase_fuse import fused
 from mushpipe.stages.phase_learned import add_discs, agreement, candidates_of
 from mushpipe.stages.phase_refit import Table, refit
 from mushpipe.stages.phase_votes import CELL, peaks, rings_between, summed, vote
-from mushpipe.stages.verifier import Verifier, load_verifier
+from mushpipe.stages.verifier import load_verifier
 
 Positive = Annotated[float, Field(gt=0)]
 Bytes = NDArray[np.uint8]
@@ -97,7 +97,7 @@ class PhaseHough(Stage):
     )
     verifier: GraphPath | None = Field(None, description="another verifier than the package's")
 
-    _verifier: Verifier | None = PrivateAttr(None)
+    _weights: Table | None = PrivateAttr(None)
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -168,21 +168,18 @@ class PhaseHough(Stage):
 
     def decide(self, found: Evidence) -> tuple[Rows, Table, Rows]:
         """Return the accepted rows in their order, all probabilities, and whose each edge is."""
-        verifier = self._load()
-        plain = verifier.mask if self.input == "mask" else verifier.image
-        beside = verifier.image_learned, verifier.depth_learned, verifier.low_learned
-        weights = np.stack([plain, verifier.depth, verifier.low, *beside])
         # Where no circle of the other detector lies, it has nothing to say.
         asked = (found.table[:, NAMES.index(LEARNED)] > 0).astype(np.int32)
         model = kinds(found.table, found.middle) + 3 * asked
         return decide(
-            found.edges, found.shapes, found.hits, found.table, model, weights, self.min_score
+            found.edges, found.shapes, found.hits, found.table, model, self._load(), self.min_score
         )
 
-    def _load(self) -> Verifier:
-        if self._verifier is None:
-            self._verifier = load_verifier(self.verifier)
-        return self._verifier
+    def _load(self) -> Table:
+        """Return the weights of all models, read once."""
+        if self._weights is None:
+            self._weights = load_verifier(self.verifier).stacked(self.input == "mask")
+        return self._weights
 
     def _range(self, relief: Relief | None, height: int, width: int) -> tuple[float, float]:
         """Return the smallest and largest radius, px, no larger than the image."""

@@ -132,8 +132,7 @@ def _accumulate(
         b0, b1, b2, b3, b4 = b0 + wc * e, b1 + ws * e, b2 + w * e, b3 + w3 * e, b4 + w4 * e
     a[0, 0], a[0, 1], a[0, 2], a[0, 3], a[0, 4] = a00, a01, a02, a03, a04
     a[1, 1], a[1, 2], a[1, 3], a[1, 4] = a11, a12, a13, a14
-    a[2, 2], a[2, 3], a[2, 4] = total, a23, a24
-    a[3, 3], a[3, 4], a[4, 4] = a33, a34, a44
+    a[2, 2], a[2, 3], a[2, 4], a[3, 3], a[3, 4], a[4, 4] = total, a23, a24, a33, a34, a44
     b[0], b[1], b[2], b[3], b[4] = b0, b1, b2, b3, b4
     return total
 
@@ -235,10 +234,11 @@ def refit(
     shapes, residual = np.empty((n, 5)), np.empty(n, np.float32)
     hits = np.full((n, DIRECTIONS), -2, np.int32)
     rows = np.empty(PER_DIRECTION * DIRECTIONS, np.int32)
-    kept = 0
-    firm, following = np.zeros(len(candidates), np.bool_), np.empty(n, np.int32)
+    kept = tried = 0
+    firm = np.zeros(len(candidates), np.bool_)
+    wide, following = np.empty((n, 5)), np.empty((2, n), np.int32)
     height_px, width_px = edges.pixels.shape
-    cells = np.full((height_px // BUCKET + 3, width_px // BUCKET + 3), -1, np.int32)
+    cells = np.full((2, height_px // BUCKET + 3, width_px // BUCKET + 3), -1, np.int32)
     for start in STARTS:
         for k in range(len(candidates)):
             if firm[k] or (start > 1 and candidates[k, 2] > 0.95 * largest):
@@ -247,21 +247,23 @@ def refit(
             shape[0], shape[1] = candidates[k, 0], candidates[k, 1]
             shape[2] = min(largest, start * candidates[k, 2])
             shape[3] = shape[4] = 0
-            if not (
-                fit_around(edges, height, pixel, shape, WIDE, rows)
-                and fit_around(edges, height, pixel, shape, NARROW, rows)
-            ):
+            if not fit_around(edges, height, pixel, shape, WIDE, rows):
+                continue
+            if _known(shape, wide, cells[WIDE], following[WIDE]):
+                continue  # from there the narrow fit comes to what it came to before
+            wide[tried] = shape
+            _enter(shape, tried, cells[WIDE], following[WIDE])
+            tried += 1
+            if not fit_around(edges, height, pixel, shape, NARROW, rows):
                 continue
             within = smallest * 0.9 <= shape[2] <= largest * 1.1
-            if not within or _known(shape, shapes, cells, following):
+            if not within or _known(shape, shapes, cells[NARROW], following[NARROW]):
                 continue
             n, found, residual[kept] = outline_hits(edges, shape, hits[kept])
             firm[k] = found > FIRM * n
-            if found < FAINT * n:
-                continue
-            row, column = _cell(shape, cells)
-            following[kept], cells[row, column] = cells[row, column], kept
-            kept += 1
+            if found >= FAINT * n:
+                _enter(shape, kept, cells[NARROW], following[NARROW])
+                kept += 1
     return shapes[:kept], hits[:kept], residual[:kept]
 
 
@@ -270,6 +272,13 @@ def _cell(shape: Shape, cells: Rows) -> tuple[int, int]:
     """Return row and column of an outline's centre in a grid; places beyond it count as its rim."""
     row = min(max(int(shape[1] / BUCKET), 1), cells.shape[0] - 2)
     return row, min(max(int(shape[0] / BUCKET), 1), cells.shape[1] - 2)
+
+
+@jit
+def _enter(shape: Shape, number: int, cells: Rows, following: Rows) -> None:
+    """Enter an outline in the grid; arguments as `_known`."""
+    row, column = _cell(shape, cells)
+    following[number], cells[row, column] = cells[row, column], number
 
 
 @jit

@@ -39,6 +39,14 @@ class Verifier:
     depth_learned: Table
     low_learned: Table
 
+    def stacked(self, literal: bool) -> Table:
+        """Return (6, F + 1, 4): without depth, with, low, then beside another detector.
+
+        `literal` is for edges of the mask, whose candidates have no depth.
+        """
+        alone = (self.mask if literal else self.image, self.depth, self.low)
+        return np.stack([*alone, self.image_learned, self.depth_learned, self.low_learned])
+
 
 def load_verifier(path: Path | None = None) -> Verifier:
     """Read a verifier from a file, by default the package's own.
