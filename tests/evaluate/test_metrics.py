@@ -21,8 +21,7 @@ from tests.evaluate.scenes import FRAME, bed, header, picks_of, tilted
 
 def verdict(truth: Truth, picks: Picks, number: int = 0, surface: Any = 0.0) -> Verdict:
     picks = replace(picks, surface=picks.surface + surface)
-    known = FrameTruth(truth, frame_id=FRAME)
-    at = header(number)
+    known, at = FrameTruth(truth, frame_id=FRAME), header(number)
     return judge("bed", ("stamp_ns", at.stamp_ns), known, at, of_picks(picks))
 
 

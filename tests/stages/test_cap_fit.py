@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from mushpipe import Camera, Circles, DepthSource, InputError, Locations, Poses, RgbdFrame
+from mushpipe import Camera, Circles, DepthSource, Locations, Poses
 from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.cap_model import ROOM, SIZE, fill_rows, move, span
 from mushpipe.stages.upright import pixel_rays, upright
@@ -148,98 +148,6 @@ def test_a_lens_with_distortion_is_followed() -> None:
     assert angle(poses.axis[0], true.axis) < 2
     assert np.linalg.norm(poses.apex[0] - true.apex) < 8e-4
     assert locations.diameter[0] == pytest.approx(0.044, abs=4e-4)
-
-
-ONE = Circles([[160.0, 120.0]], [20.0], [1.0])
-
-
-def missing(depth: np.ndarray | None, circles: Circles = ONE) -> None:
-    gray = np.full((240, 320), 0.3)
-    frame = frame_from(np.zeros((240, 320)) if depth is None else depth, gray)
-    if depth is None:
-        frame = RgbdFrame(frame.header, frame.color, None, 1.0, CAMERA)
-    locations, poses = CapFit().process(frame, circles)
-    assert locations.source.tolist() == [DepthSource.MISSING] * len(circles)
-    assert np.isnan(locations.position).all()
-    assert np.isnan(locations.diameter).all()
-    assert not poses.valid.any()
-    assert np.isnan(poses.sigma_rad).all()
-
-
-def test_without_depth_everything_is_missing() -> None:
-    missing(None)
-
-
-def test_without_any_valid_pixel_everything_is_missing() -> None:
-    missing(np.full((240, 320), np.nan))
-
-
-def test_depth_only_on_the_soil_is_no_mushroom() -> None:
-    depth = np.full((240, 320), 0.44)
-    v, u = np.mgrid[:240, :320]
-    depth[(u - 160) ** 2 + (v - 120) ** 2 <= 23**2] = np.nan
-    missing(depth)
-
-
-def test_one_pixel_is_not_enough() -> None:
-    depth = np.full((240, 320), np.nan)
-    depth[120, 160] = 0.4
-    missing(depth)
-
-
-def test_a_circle_outside_of_the_image_is_missing() -> None:
-    depth = np.full((240, 320), 0.44)
-    missing(depth, Circles([[900.0, 500.0], [-80.0, -5.0]], [20.0, 9.0], [1.0, 1.0]))
-
-
-def test_infinite_depth_is_missing_depth() -> None:
-    depth = np.full((240, 320), np.inf)
-    frame = RgbdFrame(
-        frame_from(np.zeros((240, 320)), np.zeros((240, 320))).header,
-        np.zeros((240, 320, 3), np.uint8),
-        depth.astype(np.float32),
-        1.0,
-        CAMERA,
-    )
-    locations, _ = CapFit().process(frame, ONE)
-    assert locations.source[0] == DepthSource.MISSING
-
-
-def test_no_circles_give_nothing() -> None:
-    none = Circles(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
-    missing(np.full((240, 320), 0.4), none)
-
-
-def test_depth_without_calibration_is_an_input_error() -> None:
-    frame = frame_from(np.full((240, 320), 0.4), np.zeros((240, 320)), None)
-    with pytest.raises(InputError, match="without the camera's calibration: record camera_info"):
-        CapFit().process(frame, ONE)
-
-
-def test_where_tilt_cannot_be_seen_the_sigma_says_so() -> None:
-    # a hemisphere seen from above looks the same however it leans
-    _, ball = fit([cap(0, 0, (0, 0, 0.4), 0.02, 1.0)], tilt_deg=25)
-    _, flat = fit([cap(0, 0, (0, 0, 0.4), 0.02, 0.45)], tilt_deg=25)
-    assert ball.sigma_rad[0] > 2 * flat.sigma_rad[0]
-
-
-def test_a_cap_that_does_not_fit_the_model_says_so_in_its_sigmas() -> None:
-    true = cap(15, 60, (0, 0, 0.4), 0.022, 0.55)
-    depth, gray = draw([true], 0.44)
-    v, u = np.mgrid[:240, :320]
-    knobs = 0.003 * np.sin(u / 5) * np.sin(v / 5)
-    stage, circles = CapFit(up="camera"), circles_of([true])
-    locations, poses = stage.process(frame_from(depth, gray), circles)
-    lumpy = np.where(depth < 0.44, depth + knobs, depth)
-    others, lumps = stage.process(frame_from(lumpy, gray), circles)
-    assert lumps.sigma_rad[0] > 1.3 * poses.sigma_rad[0]
-    assert others.sigma_diameter[0] > 1.2 * locations.sigma_diameter[0]
-    assert angle(lumps.axis[0], true.axis) < 3 * np.degrees(lumps.sigma_rad[0])
-
-
-def test_an_upright_without_direction_is_refused() -> None:
-    with pytest.raises(ValueError, match="the upright has no direction"):
-        CapFit.model_validate({"up": [0, 0, 0]})
 
 
 def some_cap(bulge: float) -> np.ndarray:
