@@ -2,7 +2,7 @@
 
     python benchmarks/localization.py --family b --seeds 5000:5003
 
-The circles are those of `graphs/classic.yaml`, paired with the truth as `mushpipe eval` does.
+The circles are those of `graphs/pick.yaml`, paired with the truth as `mushpipe eval` does.
 Errors in mm; z2 is the mean of (error / stated sigma)^2. `seen`: nothing hides the centre;
 `holes`: there is no depth at it.
 """
@@ -16,12 +16,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from pose_scenes import SETS, frames, true_circles, truth_of
+from pose_scenes import SETS, detected, frames, true_circles, truth_of
 
-from mushpipe import Circles, DepthSource, Locations, Mask, RgbdFrame
-from mushpipe.core.document import read_document
-from mushpipe.core.graph import compile_document
-from mushpipe.core.plugins import load_registry
+from mushpipe import Circles, DepthSource, Locations, RgbdFrame
 from mushpipe.core.truth import INSTANCES_TOPIC
 from mushpipe.evaluate.matching import match
 from mushpipe.evaluate.truth import FrameTruth
@@ -32,28 +29,11 @@ from mushpipe.stages.nearest_depth import NearestDepth
 from mushpipe.stages.picks import MakePicks
 from mushpipe.stages.surface_fit import SurfaceFit
 
-GRAPH = Path(__file__).parents[1] / "graphs" / "classic.yaml"
 MOVING = {"distance": 0.5, "size_mm": (20, 55), "count": 70, "step_mm": 15, "travel_mm": 60,
           "fps": 10}  # fmt: skip
 TIMED = {"distance": 0.65, "size_mm": (20, 50), "tilt_deg": (0, 25), "count": 240, "cluster": 0.5}
 CORRECT = DepthCorrect(offset_mm=2.85)
 Method = Callable[[list[RgbdFrame], Circles], Locations]
-
-
-def detector() -> Callable[[RgbdFrame], Circles]:
-    """Return the detector of the graph, for circles of any size."""
-    overrides = ["detect.radius_px=[8,160]"]
-    plan = compile_document(read_document(GRAPH), load_registry(), overrides)
-    stages = {node.name: node.plugin for node in plan.stages}
-    for name in ("flatten", "segment", "open", "detect"):
-        stages[name].open()
-
-    def detect(frame: RgbdFrame) -> Circles:
-        mask: Mask = stages["segment"].process(stages["flatten"].process(frame))
-        circles: Circles = stages["detect"].process(frame, stages["open"].process(mask))
-        return circles
-
-    return detect
 
 
 def methods() -> dict[str, Method]:
@@ -105,7 +85,7 @@ def row(table: np.ndarray) -> str:
     return line
 
 
-def accuracy(options: argparse.Namespace, detect: Callable[[RgbdFrame], Circles]) -> None:
+def accuracy(options: argparse.Namespace) -> None:
     """Print the table of the methods."""
     first, last = map(int, options.seeds.split(":"))
     tables: dict[str, dict[str, list[np.ndarray]]] = {}
@@ -114,12 +94,11 @@ def accuracy(options: argparse.Namespace, detect: Callable[[RgbdFrame], Circles]
         for scene in scenes:
             for seed in range(first, last):
                 taken = frames(scene, seed, options.family, 5, options.cache)
-                circles = detect(taken[0])
-                known = FrameTruth(truth_of(taken[0]))
-                paired = match(known, circles.center, circles.radius, 0.5)
+                circles, true = detected(taken[0])
+                rows = np.flatnonzero(true >= 0)
                 for method, locate in compared.items():
                     found = locate(taken, circles)
-                    table = errors(found, taken, (paired.found, paired.truth))
+                    table = errors(found, taken, (rows, true[rows]))
                     tables.setdefault(method, {}).setdefault(name, []).append(table)
     print(f"{'':26s} {'n':>5s} {'miss':>4s} | {'Z bias':>6s} {'std':>5s} {'p95':>5s} {'z2':>5s} | "
           f"{'D bias':>6s} {'std':>5s} {'p95':>5s} {'z2':>5s} |")  # fmt: skip
@@ -170,14 +149,15 @@ def edge_radius(frame: RgbdFrame) -> np.ndarray:
     return np.array(radii)
 
 
-def steps(options: argparse.Namespace, detect: Callable[[RgbdFrame], Circles]) -> None:
+def steps(options: argparse.Namespace) -> None:
     """Print how often an id stays with its mushroom while the camera moves 15 mm per frame."""
     first, last = map(int, options.seeds.split(":"))
     kept = total = seen = 0
     for seed in range(first, last):
-        locate, pick, before = SurfaceFit(), MakePicks(), {}
+        locate, pick = SurfaceFit(), MakePicks()
+        before: dict[int, int] = {}
         for frame in frames(MOVING, seed, options.family, 6, options.cache):
-            circles = detect(frame)
+            circles, _ = detected(frame)
             picks = pick.process(frame, circles, locate.process(CORRECT.process(frame), circles))
             truth = truth_of(frame)
             paired = match(FrameTruth(truth), picks.center, picks.radius, 0.5)
@@ -223,13 +203,12 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, help="folder that keeps rendered frames")
     options = parser.parse_args()
     parts = options.parts.split(",")
-    detect = detector() if {"accuracy", "ids"} & set(parts) else None
-    if detect and "accuracy" in parts:
-        accuracy(options, detect)
+    if "accuracy" in parts:
+        accuracy(options)
     if "fusion" in parts:
         fusion(options)
-    if detect and "ids" in parts:
-        steps(options, detect)
+    if "ids" in parts:
+        steps(options)
     if "time" in parts:
         times(options)
 

@@ -7,20 +7,22 @@ import json
 import pickle
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from mushpipe import Circles, RgbdFrame
+from mushpipe.core.document import read_document
+from mushpipe.core.graph import compile_document
+from mushpipe.core.plugins import load_registry
 from mushpipe.core.truth import TRUTH_TOPIC, Ignore, Truth
 from mushpipe.evaluate.matching import match
 from mushpipe.evaluate.truth import FrameTruth
 from mushpipe.sources.synthetic import SyntheticSource
-from mushpipe.stages.chan_vese import ChanVese
-from mushpipe.stages.flatten import Flatten
-from mushpipe.stages.opening import Opening
+from mushpipe.stages.cap_net import CapNet
 from mushpipe.stages.phase_hough import PhaseHough
 
+GRAPH = Path(__file__).parents[1] / "graphs" / "pick.yaml"
 _HARD = {"size_mm": (20, 60), "tilt_deg": (0, 45), "cluster": 0.4}
 # name -> scenes that are pooled
 SETS: dict[str, list[dict[str, Any]]] = {
@@ -63,18 +65,20 @@ def truth_of(frame: RgbdFrame) -> Truth:
 
 
 @lru_cache
-def detector() -> tuple[Flatten, ChanVese, Opening, PhaseHough]:
-    """Return the stages of `graphs/classic.yaml` that find circles, for caps of any size."""
-    stages = Flatten(), ChanVese(channel="auto"), Opening(size=10), PhaseHough(radius_px=None)
-    for stage in stages:
-        stage.open()
-    return stages
+def detector() -> tuple[CapNet, PhaseHough]:
+    """Return the stages of `graphs/pick.yaml` that find circles, for caps of any size."""
+    plan = compile_document(read_document(GRAPH), load_registry(), ["detect.radius_px=null"])
+    stages = {node.name: node.plugin for node in plan.stages}
+    net, detect = cast(CapNet, stages["net"]), cast(PhaseHough, stages["detect"])
+    net.open()
+    detect.open()
+    return net, detect
 
 
 def detected(frame: RgbdFrame) -> tuple[Circles, np.ndarray]:
     """Return the circles a detector finds, and for each the row of its mushroom, -1 for none."""
-    flatten, segment, opening, detect = detector()
-    circles = detect.process(frame, opening.process(segment.process(flatten.process(frame))))
+    net, detect = detector()
+    circles = detect.process(frame, *net.process(frame))
     rows = np.full(len(circles), -1)
     matching = match(FrameTruth(truth_of(frame)), circles.center, circles.radius)
     rows[matching.found] = matching.truth

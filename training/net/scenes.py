@@ -96,7 +96,7 @@ def settings(seed: int) -> dict[str, Any]:
     if lab and rng.random() < 0.5:  # models turned from wood
         drawn |= {"cap_color": "wood", "printed": True, "table": "wood"}
         drawn |= {"count": int(rng.integers(3, 25)), "size_mm": (small + 10, small + 50)}
-    return drawn
+    return drawn | {"sunk": some(0.4, 1), "lids": round(some(0.3, 10))}
 
 
 def picture(seed: int, cache: Path) -> Picture:
