@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from pose_scenes import SETS, detected, frames, true_circles, truth_of
+from pose_scenes import SETS, detected, found_in, frames, true_circles, truth_of
 
 from mushpipe import Circles, DepthSource, Locations, RgbdFrame
 from mushpipe.core.truth import INSTANCES_TOPIC
@@ -157,7 +157,7 @@ def steps(options: argparse.Namespace) -> None:
         locate, pick = SurfaceFit(), MakePicks()
         before: dict[int, int] = {}
         for frame in frames(MOVING, seed, options.family, 6, options.cache):
-            circles, _ = detected(frame)
+            circles = found_in(frame)
             picks = pick.process(frame, circles, locate.process(CORRECT.process(frame), circles))
             truth = truth_of(frame)
             paired = match(FrameTruth(truth), picks.center, picks.radius, 0.5)

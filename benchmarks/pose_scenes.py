@@ -75,10 +75,15 @@ def detector() -> tuple[CapNet, PhaseHough]:
     return net, detect
 
 
-def detected(frame: RgbdFrame) -> tuple[Circles, np.ndarray]:
-    """Return the circles a detector finds, and for each the row of its mushroom, -1 for none."""
+def found_in(frame: RgbdFrame) -> Circles:
+    """Return the circles that the detector finds."""
     net, detect = detector()
-    circles = detect.process(frame, *net.process(frame))
+    return detect.process(frame, *net.process(frame))
+
+
+def detected(frame: RgbdFrame) -> tuple[Circles, np.ndarray]:
+    """Return the circles that are found, and for each the row of its mushroom, -1 for none."""
+    circles = found_in(frame)
     rows = np.full(len(circles), -1)
     matching = match(FrameTruth(truth_of(frame)), circles.center, circles.radius)
     rows[matching.found] = matching.truth
