@@ -239,3 +239,6 @@ def main() -> None:
     except BrokenPipeError:
         sys.stderr.close()
         sys.exit(0)
+    except OSError as error:  # a full disk, a folder that may not be written to
+        sys.stderr.write(f"error: {error.filename or 'output'}: {error.strerror or error}\n")
+        sys.exit(1)

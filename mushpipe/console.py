@@ -19,9 +19,11 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from mushpipe.core.errors import EXIT_INTERRUPTED
+from mushpipe.core.overwriting import spare
 from mushpipe.core.plan import Plan
 from mushpipe.core.report import RunReport
 from mushpipe.core.run import run
+from mushpipe.core.stage import Source
 
 stderr = Console(stderr=True, highlight=False, soft_wrap=True)
 
@@ -86,17 +88,19 @@ def execute(
     plan: Plan, manifest: Path | None, capsules: Path, size: Callable[[], int] | None = None
 ) -> RunReport:
     """Run a plan in front of a user; ``manifest`` None writes none, ``size`` see above."""
+    source = plan.source.plugin
+    spare(manifest, *(source.files() if isinstance(source, Source) else ()))
     stop = threading.Event()
     with interruptible(stop), progress_bar(size) as show:
         report = run(plan, stop, show, capsules)
     show_report(report)
+    if report.error is not None:
+        stderr.print(f"error: {report.error}", style="bold red", markup=False)
     if manifest is not None and report.exit_code != 2:  # a wrong command line is no run
         manifest.parent.mkdir(parents=True, exist_ok=True)
         content = {**report.manifest, "result": report.summary()}
         manifest.write_text(json.dumps(content, indent=2) + "\n")
         stderr.print(f"manifest: {manifest}", style="dim")
-    if report.error is not None:
-        stderr.print(f"error: {report.error}", style="bold red", markup=False)
     return report
 
 

@@ -65,9 +65,11 @@ def view(
     """Open a recording or results in the Rerun viewer."""
     from mushpipe.console import interruptible, set_up_logging
     from mushpipe.core.errors import DependencyError
+    from mushpipe.core.overwriting import spare
     from mushpipe.sinks.rerun import RerunSink, has_display
 
     set_up_logging(False)
+    spare(save, file)
     spawn = save is None and serve is None
     if spawn and not has_display():
         raise DependencyError(

@@ -66,7 +66,7 @@ class Passage:
     frame: RgbdFrame
     outputs: Outputs
     durations_ns: dict[str, int] = field(default_factory=dict)
-    failed: tuple[Node, Exception] | None = None
+    failed: tuple[Node, BaseException] | None = None
 
     def trace(self) -> Trace:
         """Return what the sinks get."""
@@ -106,7 +106,7 @@ class Chain:
         begin = time.perf_counter_ns()
         try:
             passage.outputs[node.name] = self._call(node, passage)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             passage.failed = (node, error)
         else:
             passage.durations_ns[node.name] = time.perf_counter_ns() - begin

@@ -98,6 +98,9 @@ class Camera:
     def __post_init__(self) -> None:
         if not (self.width > 0 and self.height > 0 and self.fx > 0 and self.fy > 0):
             raise ValueError(f"size and focal length of a camera must be positive: {self}")
+        numbers = (self.fx, self.fy, self.cx, self.cy, *self.coefficients)
+        if not np.isfinite(numbers).all():
+            raise ValueError(f"the numbers of a camera must be finite: {self}")
         if len(self.coefficients) != COEFFICIENTS.get(self.model):
             raise ValueError(
                 f"camera model '{self.model}' with {len(self.coefficients)} coefficients; "

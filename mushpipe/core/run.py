@@ -14,6 +14,7 @@ from mushpipe.core.chain import Chain, Passage, Turnstile, cores_shared, sink_in
 from mushpipe.core.edges import SinkThread, SourceThread, failure, interruptible_opening
 from mushpipe.core.errors import MushpipeError, StageError, UsageError
 from mushpipe.core.manifest import build_manifest
+from mushpipe.core.overwriting import same_file
 from mushpipe.core.plan import Node, Plan
 from mushpipe.core.report import Durations, RunReport
 from mushpipe.core.stage import Plugin, RunInfo, Sink, Source, Stage
@@ -108,17 +109,20 @@ class _Runner:
             device = {"device": self.report.device} if self.report.device else {}
             manifest = {**self.report.manifest, **device}
             info = RunInfo(source.name(), manifest, source.live, lambda: reader.box.accepted)
-            self._spare_the_recording(source, info)
+            self._spare_files(source, info)
         return info
 
-    def _spare_the_recording(self, source: Source, info: RunInfo) -> None:
-        """Raise UsageError where a sink would write over the recording that is played."""
-        played = {path.resolve() for path in source.files()}
+    def _spare_files(self, source: Source, info: RunInfo) -> None:
+        """Raise UsageError where a sink would write over what is played, or another sink's file."""
+        taken = [("its own source", path) for path in source.files()]
         for node in self.plan.sinks:
-            files = node.plugin.files(info) if isinstance(node.plugin, Sink) else ()
+            with _named(node):
+                files = node.plugin.files(info) if isinstance(node.plugin, Sink) else ()
             for path in files:
-                if path.resolve() in played:
-                    raise UsageError(f"sink '{node.name}' would write over its own source {path}")
+                for whose, other in taken:
+                    if same_file(path, other):
+                        raise UsageError(f"sink '{node.name}' would write over {whose} {path}")
+            taken += [(f"the file of sink '{node.name}',", path) for path in files]
 
     def _finish(self, threads: list[SinkThread]) -> None:
         """Tell the sinks how the run went; the first error of the run stays the one reported."""
@@ -211,7 +215,7 @@ class _Runner:
             self.progress(self.report)
         self.over = self._at_end(threads)
 
-    def _count_failure(self, frame: RgbdFrame, node: Node, error: Exception) -> None:
+    def _count_failure(self, frame: RgbdFrame, node: Node, error: BaseException) -> None:
         """Count a frame on which a stage failed; raise StageError where that ends the run."""
         failed = failure(node, frame.header.sequence, error)
         if not isinstance(error, MushpipeError):

@@ -82,10 +82,12 @@ def calibrate_depth(
     seed: SeedOption = 0,
 ) -> None:
     """Find what `depth-correct` must take off, from planes at known distances."""
+    from mushpipe.core.overwriting import spare
     from mushpipe.evaluate.calibrate import fit_correction
     from mushpipe.evaluate.plane import judge_planes
     from mushpipe.evaluate.show import plane_table
 
+    spare(out, *recordings)
     rows, _, _ = judge_planes(recordings, plane, [], resamples, seed)
     correction = fit_correction(rows, order)
     _print([plane_table(rows)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -55,7 +56,7 @@ def as_server(
     """Send to one client, on loopback, what the server sent; return how many lines that were.
 
     Every message says ``replay``, and an answer waits for a request of the client, whose id it
-    takes. ``listening`` is told the port.
+    takes. Lines for ABB go only to a client that said ``REPLAY``. ``listening`` is told the port.
     """
     with socket.create_server(("127.0.0.1", port)) as server:
         server.settimeout(SILENCE_S)
@@ -78,10 +79,17 @@ class _Asked:
         self._heard = iter(heard)
         self._show = show
 
+    def next_line(self) -> bytes | None:
+        """Wait for a line; None where the client leaves."""
+        line = next(self._heard, None)
+        if line is None:
+            return None
+        self._show("<", line.rstrip(b"\r\n"))
+        return line
+
     def next_id(self) -> Any:
         """Wait for a request and return its id; None where the client leaves."""
-        for line in self._heard:
-            self._show("<", line.rstrip(b"\r\n"))
+        while (line := self.next_line()) is not None:
             identity = _identity(line)
             if identity is not None:
                 return identity
@@ -97,13 +105,21 @@ def _identity(line: bytes) -> Any:
 
 
 def _answers(lines: Iterable[Line], asked: _Asked) -> Iterator[bytes]:
+    greeted = False
     for line in lines:
         if line.kind != "tx":
             continue
         try:
             body = orjson.loads(line.text)
-        except ValueError:  # a line for ABB; it waits for whatever the client says
-            yield line.text
+        except ValueError:  # for ABB, where every line answers one
+            request = asked.next_line()
+            if request is None:
+                return
+            greeted = greeted or b"REPLAY" in request.strip().split(b",")
+            if not greeted:
+                yield b"E,REPLAY_REFUSED"
+                return
+            yield re.sub(rb",LIVE$", b",REPLAY", line.text)
             continue
         if body.get("id") is not None:
             body["id"] = asked.next_id()

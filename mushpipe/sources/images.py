@@ -81,7 +81,9 @@ def decode_color(message: Any) -> NDArray[np.uint8]:
 def _decode_compressed_color(message: Any) -> NDArray[np.uint8]:
     import cv2
 
-    image = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_COLOR)
+    # Depth is not turned as a camera's EXIF may ask for colour.
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(np.frombuffer(message.data, np.uint8), flags)
     if image is None:
         raise ValueError(f"compressed image ({message.format or 'no format'}) cannot be decoded")
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
@@ -137,14 +139,22 @@ def _decode_compressed_depth(message: Any, scale: float | None) -> tuple[NDArray
     return metres, _known_scale(scale, 1.0, "32FC1")
 
 
-def decode_camera(message: Any) -> Camera | None:
+def decode_camera(message: Any, rectified: bool = False) -> Camera | None:
     """Decode CameraInfo or CameraCalibration; None where it says that it is not calibrated.
 
+    Args:
+        message: As recorded.
+        rectified: Whether the images have no distortion any more: by the convention of ROS P holds
+            for them then, not K and D.
+
     Raises:
-        ValueError: The distortion model is one that is not implemented.
+        ValueError: The distortion model is one that is not implemented, or a number is not finite.
     """
     k = list(message.k if hasattr(message, "k") else message.K)
     d = [float(v) for v in (message.d if hasattr(message, "d") else message.D)]
+    if rectified:
+        p, d = list(message.p if hasattr(message, "p") else message.P), []
+        k = [*p[:3], *p[4:7], *p[8:11]] if len(p) == 12 and p[0] > 0 else k
     if len(k) != 9 or not (k[0] > 0 and k[4] > 0):
         return None
     model: str = "none"

@@ -20,7 +20,7 @@ from mushpipe.sources.playing import NO_DEPTH, Player, RecordedSource
 from mushpipe.sources.topics import choose_topics
 
 logger = logging.getLogger("mushpipe")
-NO_CAMERA = "%s has no calibration: nothing can be measured in metres"
+NO_CAMERA = "%s has no calibration%s: nothing can be measured in metres"
 
 
 class McapSource(RecordedSource, ReplaySource):
@@ -87,7 +87,7 @@ class McapSource(RecordedSource, ReplaySource):
         end_ns = None if self.end is None else index.start_ns + round(self.end * 1e9)
         camera = _first_camera(player, reader, start_ns)
         if camera is None and self.camera is None:
-            logger.warning(NO_CAMERA, self.path.name)
+            logger.warning(NO_CAMERA, self.path.name, f" ({player.error})" if player.error else "")
         delivered = turn = shift = shift_ns = 0
         while turn < self.loop or self.loop == 0:
             first = last = None
@@ -131,7 +131,7 @@ def _beside(index: Index) -> set[str]:
 
 def _first_camera(player: Player, reader: RecordingReader, start_ns: int) -> Camera | None:
     """Return the calibration in force at the start, which may be recorded after it."""
-    if player.topics.camera is None:
+    if player.topics.camera is None or player.settings.camera is not None:
         return None
     topic = {player.topics.camera}
     before = reader.messages(topic, 0, start_ns + 1) if start_ns else ()

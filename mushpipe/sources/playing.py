@@ -30,7 +30,7 @@ NO_DEPTH = "%s has no depth: positions, distances and diameters will be missing"
 class Intrinsics(BaseModel):
     """A pinhole camera without distortion, for recordings that carry no calibration."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     fx: float = Field(gt=0, description="focal length along x, px")
     fy: float = Field(gt=0, description="focal length along y, px")
@@ -125,6 +125,8 @@ class Player:
 
     def _take(self, raw: Raw, pairing: Pairing[_Color, _Depth]) -> Iterator[RgbdFrame]:
         if raw.channel.topic == self.topics.camera:
+            if self.settings.camera is not None:
+                return  # that of the recording does not matter
             self.camera = self.calibration(raw, "calibrations") or self.camera
         elif raw.channel.topic == self.topics.depth:
             depth = self._decode(raw, self._depth)
@@ -154,7 +156,9 @@ class Player:
 
     def calibration(self, raw: Raw, what: str = "") -> Camera | None:
         """Decode a calibration; one that cannot be is counted, where ``what`` says as what."""
-        return self._decode(raw, lambda message, _: decode_camera(message), what)
+        name = self.topics.color.rsplit("/", 2)
+        rectified = any("rect" in part for part in name[1:])  # image_rect_color/compressed, say
+        return self._decode(raw, lambda message, _: decode_camera(message, rectified), what)
 
     def _decode(
         self, raw: Raw, decode: Callable[[Any, Raw], T | None], what: str = "images"
@@ -175,7 +179,8 @@ class Player:
     def _color(self, message: Any, raw: Raw) -> _Color:
         stamp_ns, frame_id = _stamp(message, raw)
         header = Header(stamp_ns, raw.message.sequence, frame_id, raw.message.log_time)
-        return header, decode_color(message)
+        # A calibration that changes holds from there on, not for images that wait for their depth.
+        return header, decode_color(message), self.camera
 
     def _depth(self, message: Any, raw: Raw) -> tuple[int, _Depth]:
         stated = raw.channel.metadata.get("depth_scale")
@@ -187,7 +192,7 @@ class Player:
         return (self._frame(color, depth) for color, depth in pairs)
 
     def _frame(self, color: _Color, depth: _Depth | None) -> RgbdFrame:
-        header, image = color
+        header, image, camera = color
         sequence = header.sequence if self.numbered else self.frames
         header = replace(header, sequence=sequence)
         self.frames += 1
@@ -200,14 +205,14 @@ class Player:
         self._watch_size(image.shape[:2], sequence)
         try:
             native, scale = depth[1:] if depth else (None, 0.001)
-            return RgbdFrame(header, image, native, scale, self._camera(image.shape[:2]))
+            return RgbdFrame(header, image, native, scale, self._camera(image.shape[:2], camera))
         except ValueError as error:
             raise InputError(f"{self.name}, frame {sequence}: {error}") from error
 
-    def _camera(self, size: tuple[int, ...]) -> Camera | None:
+    def _camera(self, size: tuple[int, ...], recorded: Camera | None) -> Camera | None:
         given = self.settings.camera
         if given is None:
-            return self.camera
+            return recorded or self.camera
         return Camera(size[1], size[0], given.fx, given.fy, given.cx, given.cy)
 
     def _watch_size(self, size: tuple[int, ...], sequence: int) -> None:
@@ -217,7 +222,7 @@ class Player:
         self.size = size
 
 
-_Color = tuple[Header, Any]
+_Color = tuple[Header, Any, Camera | None]
 _Depth = tuple[str, Any, float]
 
 

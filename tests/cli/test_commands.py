@@ -244,6 +244,39 @@ def test_a_recording_is_never_written_over_by_its_own_run(folder: Path) -> None:
     assert (folder / "a.mcap").read_bytes() == before
 
 
+def test_two_sinks_never_write_one_file(folder: Path) -> None:
+    text = (folder / "graph.yaml").read_text()
+    (folder / "graph.yaml").write_text(text + "  again: {use: mcap, path: ./out.mcap}\n")
+    mushpipe("record", "--source", "synthetic", "--frames", 1, "-o", "a.mcap", cwd=folder)
+    done = mushpipe(
+        *("run", "graph.yaml", "--source", "a.mcap", "--set", "log.path=./out.mcap"), cwd=folder
+    )
+    assert done.returncode == EXIT_USAGE
+    assert "sink 'again' would write over the file of sink 'log', " in done.stderr
+
+
+def test_no_command_writes_over_what_it_reads(folder: Path) -> None:
+    mushpipe("record", "--source", "synthetic", "--frames", 1, "-o", "a.mcap", cwd=folder)
+    (folder / "b.mcap").hardlink_to(folder / "a.mcap")
+    before = (folder / "a.mcap").read_bytes()
+    for arguments in (
+        ("view", "a.mcap", "--save", "b.mcap"),
+        ("calibrate", "depth", "a.mcap", "--plane", "0.5", "-o", "b.mcap"),
+        ("run", "graph.yaml", "--source", "a.mcap", "--manifest", "b.mcap"),
+    ):
+        done = mushpipe(*arguments, cwd=folder)
+        assert done.returncode == EXIT_USAGE, done.stderr
+        assert "b.mcap is what is read, and would be written over" in done.stderr
+        assert (folder / "a.mcap").read_bytes() == before
+
+
+def test_a_file_that_cannot_be_written_is_named(folder: Path) -> None:
+    done = mushpipe("schema", "-o", "/proc/nowhere/schema.json", cwd=folder)
+    assert done.returncode == EXIT_FAILED
+    assert done.stderr.startswith("error: /proc/nowhere")
+    assert "Traceback" not in done.stderr
+
+
 def test_the_results_of_a_failed_run_say_how_it_ended(folder: Path) -> None:
     (folder / "mine.py").write_text(
         "from mushpipe import Mask, RgbdFrame, Stage\n\n"

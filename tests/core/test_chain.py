@@ -138,15 +138,17 @@ def test_a_later_frame_that_fails_first_does_not_count_before_its_turn(lab: Lab,
 
 
 @pytest.mark.parametrize("at", range(4))
-def test_a_stage_that_leaves_the_program_ends_the_run_on_any_thread(lab: Lab, at: int) -> None:
+def test_a_stage_that_exits_fails_like_any_other_on_any_thread(lab: Lab, at: int) -> None:
     class Leaves(Stage):
         def process(self, frame: RgbdFrame) -> Circles:
             if frame.header.sequence == at:
                 raise SystemExit(7)
             return circles(1)
 
-    with pytest.raises(SystemExit, match="7"):
-        lab.run(lab.chain("threshold", Leaves), "source.count=50")
+    report = lab.run(lab.chain("threshold", Leaves), "source.count=50")
+    assert (report.exit_code, report.processed, report.failed) == (1, at, 1)
+    assert report.balanced()
+    assert f"failed on frame {at}: SystemExit: 7" in str(report.error)
 
 
 def test_what_a_run_sets_for_its_threads_is_put_back(lab: Lab) -> None:

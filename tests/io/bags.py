@@ -94,6 +94,7 @@ def camera_info(
     k: tuple[float, ...] = (FX, 0, CX, 0, FY, CY, 0, 0, 1),
     d: tuple[float, ...] = (0, 0, 0, 0, 0),
     model: str = "plumb_bob",
+    p: tuple[float, ...] = (0,) * 12,
 ) -> Any:
     region = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0)
     return ros(
@@ -105,7 +106,7 @@ def camera_info(
         d=np.array(d, float),
         k=np.array(k, float),
         r=np.eye(3).ravel(),
-        p=np.zeros(12),
+        p=np.array(p, float),
         binning_x=0,
         binning_y=0,
         roi=ros("sensor_msgs/msg/RegionOfInterest", **region, do_rectify=False),

@@ -25,6 +25,7 @@ from tests.io.bags import (
     camera_info,
     color_at,
     color_pixels,
+    depth_at,
     drain,
     play,
     raw_image,
@@ -177,3 +178,39 @@ def test_a_change_of_size_that_the_calibration_follows_is_played(tmp_path: Path)
 def test_foxglove_calibration(tmp_path: Path) -> None:
     frames = play(write_foxglove(tmp_path / "f.mcap", 2))
     assert [frame.camera for frame in frames] == [CALIBRATED] * 2
+
+
+def test_a_new_calibration_does_not_reach_back_to_an_image_that_waits_for_its_depth(
+    tmp_path: Path,
+) -> None:
+    k = (500.0, 0, CX, 0, 500.0, CY, 0, 0, 1)
+    late = [depth_at(i, T0 + i * PERIOD + 5_000_000) for i in range(4)]
+    entries = [info_at(0)]
+    for i in range(4):
+        entries += [info_at(2, k=k)] if i == 2 else []
+        entries += [color_at(i), late[i]]
+    found = [camera.fx for camera in cameras(tmp_path, entries) if camera]
+    assert found == [FX, FX, 500.0, 500.0]
+
+
+def test_rectified_images_have_the_projection_matrix_and_no_distortion(tmp_path: Path) -> None:
+    p = (500.0, 0, 3, 0, 0, 510.0, 2, 0, 0, 0, 1, 0)
+    info = camera_info(d=(0.1, 0, 0, 0, 0), p=p)
+    topic = "/camera/color/image_rect_color"
+    entries = [("/camera/color/camera_info", T0, info), color_at(0, topic=topic)]
+    assert cameras(tmp_path, entries) == [Camera(WIDTH, HEIGHT, 500.0, 510.0, 3.0, 2.0)]
+
+
+def test_a_given_camera_takes_the_place_of_one_that_cannot_be_decoded(tmp_path: Path) -> None:
+    given = {"fx": 600.0, "fy": 600.0, "cx": 3.0, "cy": 2.0}
+    entries = [info_at(0, d=(0.1, 0, 0, 0), model="equidistant"), *COLORS]
+    expected = Camera(WIDTH, HEIGHT, 600.0, 600.0, 3.0, 2.0)
+    assert cameras(tmp_path, entries, camera=given) == [expected] * 3
+
+
+@pytest.mark.parametrize("value", [float("inf"), float("nan")])
+def test_a_camera_has_finite_numbers(value: float) -> None:
+    with pytest.raises(ValueError, match="finite"):
+        McapSource(path="a.mcap", camera={"fx": value, "fy": 600, "cx": 3, "cy": 2})
+    with pytest.raises(ValueError, match="finite"):
+        Camera(WIDTH, HEIGHT, FX, FY, value, CY)

@@ -106,6 +106,15 @@ def test_png_color_is_exact(kind: str, tmp_path: Path) -> None:
     np.testing.assert_array_equal(frame.color, RGB)
 
 
+def test_colour_is_not_turned_as_exif_asks_since_depth_is_not(tmp_path: Path) -> None:
+    jpeg = encoded(np.repeat(np.repeat(GRAY, 8, 0), 8, 1), ".jpg", cv2.IMWRITE_JPEG_QUALITY, 100)
+    tag = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x03\0\0\0\0\0\0\0"  # turned by 180
+    exif = b"\xff\xe1" + (len(tag) + 8).to_bytes(2, "big") + b"Exif\0\0" + tag
+    plain = one_frame(tmp_path / "plain", compressed(jpeg, "jpeg"))
+    turned = one_frame(tmp_path / "turned", compressed(jpeg[:2] + exif + jpeg[2:], "jpeg"))
+    assert np.array_equal(turned.color, plain.color)
+
+
 def test_jpeg_color_keeps_red_red(tmp_path: Path) -> None:
     red = np.zeros((48, 64, 3), np.uint8)
     red[..., 0] = 200

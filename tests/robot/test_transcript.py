@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import threading
 from pathlib import Path
 from queue import SimpleQueue
@@ -14,7 +15,7 @@ from mushpipe.robot import transcript as module
 from mushpipe.robot.client import RobotClient
 from mushpipe.robot.clock import Clock
 from mushpipe.robot.replay import as_client, as_server, lines_of
-from mushpipe.robot.transcript import Transcript, read_transcript
+from mushpipe.robot.transcript import Line, Transcript, read_transcript
 from tests.robot.peer import CLIENT, SERVER, Peer
 from tests.robot.scene import PATIENCE_S, FakeClock, bench
 
@@ -88,6 +89,30 @@ def test_a_server_is_replayed_to_a_client_and_never_taken_for_live(tmp_path: Pat
         assert [t["id"] for t in answer["targets"]] == ["m0", "m1"]
         assert robot.ack("m0", "accepted")
         assert robot.receive()["op"] == "bye"
+    thread.join(PATIENCE_S)
+
+
+@pytest.mark.parametrize(
+    ("hello", "expected"),
+    [
+        (b"HELLO,1", [b"E,REPLAY_REFUSED"]),
+        (b"HELLO,1,REPLAY", [b"HELLO,1,REPLAY", b"T,0,1.0,2.0,3.0", b"S,RUNNING,4,REPLAY"]),
+    ],
+)
+def test_lines_for_abb_are_replayed_to_a_robot_that_asks_for_a_recording(
+    hello: bytes, expected: list[bytes]
+) -> None:
+    said = (b"HELLO,1,LIVE", b"T,0,1.0,2.0,3.0", b"S,RUNNING,4,LIVE")
+    lines = [Line("tx", 1, text, 0) for text in said]
+    port: SimpleQueue[int] = SimpleQueue()
+    thread = threading.Thread(
+        target=as_server, args=(lines, 0, lambda *_: None, port.put), daemon=True
+    )
+    thread.start()
+    address = "127.0.0.1", port.get(timeout=PATIENCE_S)
+    with socket.create_connection(address, PATIENCE_S) as sock, sock.makefile("rb") as answers:
+        sock.sendall(hello + b"\r\nNEXT\r\nSTATE\r\n")
+        assert [line.rstrip(b"\n") for line in answers] == expected
     thread.join(PATIENCE_S)
 
 
