@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 from scipy.optimize import minimize
-from scipy.special import expit
+from scipy.special import expit, logit
 
 from mushpipe import Circles, Mask, RgbdFrame
 from mushpipe.core.truth import Ignore
@@ -86,14 +86,30 @@ def prepared(cache: Path) -> Iterator[Prepared]:
     """Yield the frames of the training, without and with the circles of `cap-net`.
 
     Beside `cap-net` its mask takes the place of a segmentation. What is learnt there is learnt on
-    varied frames as well, as that is what it is for.
+    varied frames as well, as that is what it is for. A network is surer of frames like those it was
+    trained on than of any others, so each frame comes a second time with a `doubtful` one.
     """
+    rng = np.random.default_rng(0)
     for case in training_cases(cache):
         for frame, mask in segmentations(case.frame):
             yield case, frame, mask, None
-        yield case, case.frame, *NET.process(case.frame)
+        yield from _beside(case, rng)
     for case in varied_cases(cache, "a", VARIED):
-        yield case, case.frame, *NET.process(case.frame)
+        yield from _beside(case, rng)
+
+
+def _beside(case: Case, rng: np.random.Generator) -> Iterator[Prepared]:
+    mask, circles = NET.process(case.frame)
+    yield case, case.frame, mask, circles
+    yield case, case.frame, mask, doubtful(circles, rng)
+
+
+def doubtful(circles: Circles, rng: np.random.Generator) -> Circles:
+    """Return the circles of a network less sure of all, and of some much less than of others."""
+    less = rng.uniform(0, 4) + rng.normal(0, 2, len(circles))
+    score = expit(logit(np.clip(circles.score, 1e-6, 1 - 1e-6)) - less)
+    kept = score >= NET.min_score
+    return Circles(circles.center[kept], circles.radius[kept], score[kept])
 
 
 def labels(case: Case, circles: Circles, order: NDArray[np.intp]) -> Floats:
