@@ -145,9 +145,10 @@ class PhaseHough(Stage):
         smallest, largest = self._range(relief, height, width)
         image = _levels(frame, mask, literal)
         gradient = gradient_of(image)
-        foreground = _foreground(mask, relief)
+        inside = mask.foreground.view(np.uint8)
         if learned is not None:
-            foreground = add_discs(learned, foreground)
+            inside = add_discs(learned, inside)
+        foreground = _foreground(inside, relief)
         region = np.ones_like(foreground) if literal else cv2.dilate(foreground, _AROUND)
         edges = self._edges(image, gradient, np.asarray(region, np.uint8), relief)
         cells = vote(
@@ -159,7 +160,7 @@ class PhaseHough(Stage):
         high, pixel = (relief.height, relief.pixel) if relief else (NO_RELIEF, 0.0)
         shapes, hits, residual = refit(edges, high, pixel, found, smallest, largest)
         table, middle = static_features(
-            image, gradient, mask.foreground.view(np.uint8), high, pixel, shapes, hits, residual
+            image, gradient, inside, high, pixel, shapes, hits, residual
         )
         if learned is not None:
             table[:, NAMES.index(LEARNED)] = agreement(shapes, equal_area_radius(shapes), learned)
@@ -233,12 +234,11 @@ def _levels(frame: RgbdFrame, mask: Mask, literal: bool) -> Plane:
     return np.asarray(image, np.float32) * np.float32(255)
 
 
-def _foreground(mask: Mask, relief: Relief | None) -> Bytes:
-    """Return what is in the mask or stands on the bed, (H, W) 0 or 1."""
-    foreground = mask.foreground.view(np.uint8)
+def _foreground(inside: Bytes, relief: Relief | None) -> Bytes:
+    """Return what is inside a mask or stands on the bed, (H, W) 0 or 1."""
     if relief is None:
-        return foreground
-    height, width = foreground.shape
+        return inside
+    height, width = inside.shape
     standing = (relief.height > _STANDING).view(np.uint8)
     full = cv2.resize(standing, None, fx=CELL, fy=CELL, interpolation=cv2.INTER_NEAREST)
-    return np.asarray(foreground | full[:height, :width], np.uint8)
+    return np.asarray(inside | full[:height, :width], np.uint8)
