@@ -94,13 +94,15 @@ def execute(
     with interruptible(stop), progress_bar(size) as show:
         report = run(plan, stop, show, capsules)
     show_report(report)
-    if report.error is not None:
-        stderr.print(f"error: {report.error}", style="bold red", markup=False)
-    if manifest is not None and report.exit_code != 2:  # a wrong command line is no run
-        manifest.parent.mkdir(parents=True, exist_ok=True)
-        content = {**report.manifest, "result": report.summary()}
-        manifest.write_text(json.dumps(content, indent=2) + "\n")
-        stderr.print(f"manifest: {manifest}", style="dim")
+    try:
+        if manifest is not None and report.exit_code != 2:  # a wrong command line is no run
+            manifest.parent.mkdir(parents=True, exist_ok=True)
+            content = {**report.manifest, "result": report.summary()}
+            manifest.write_text(json.dumps(content, indent=2) + "\n")
+            stderr.print(f"manifest: {manifest}", style="dim")
+    finally:  # a full disk takes no manifest either, and is not what went wrong first
+        if report.error is not None:
+            stderr.print(f"error: {report.error}", style="bold red", markup=False)
     return report
 
 

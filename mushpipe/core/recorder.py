@@ -173,10 +173,20 @@ class _Output:
 
 
 def _create(path: Path) -> FileIO:
+    """Open a file that no other run is writing, and empty it."""
+    import fcntl
+
     try:
-        return path.open("wb", buffering=0)
+        file = path.open("ab", buffering=0)
+        if path.is_file():  # a device such as /dev/null is for everybody
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            file.truncate(0)
+    except BlockingIOError as error:
+        file.close()
+        raise UsageError(f"{path} is being written by another run: give another name") from error
     except OSError as error:
         raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
+    return file
 
 
 def _standard_output() -> FileIO:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from mushpipe.core.errors import UsageError
 from mushpipe.core.recorder import RecordingError, RecordingWriter
 from mushpipe.core.recording import RecordingReader
 from mushpipe.core.wire import COLOR_TOPIC
@@ -69,3 +70,17 @@ def test_after_a_full_disk_nothing_is_written_even_when_there_is_room_again(
 def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"cannot be written: Is a directory"):
         RecordingWriter(tmp_path, {})
+
+
+def test_a_file_that_another_writer_has_open_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "out.mcap"
+    writer = RecordingWriter(path, {})
+    writer.frame(make_frame(size=SIZE))
+    with pytest.raises(UsageError, match="is being written by another run"):
+        RecordingWriter(path, {})
+    writer.close()
+    reader = RecordingReader(path)
+    assert reader.index().counts[COLOR_TOPIC] == 1
+    assert not reader.damage
+    RecordingWriter(path, {}).close()  # the run is over
+    assert not RecordingReader(path).index().counts
