@@ -156,8 +156,8 @@ class Player:
 
     def calibration(self, raw: Raw, what: str = "") -> Camera | None:
         """Decode a calibration; one that cannot be is counted, where ``what`` says as what."""
-        name = self.topics.color.rsplit("/", 2)
-        rectified = any("rect" in part for part in name[1:])  # image_rect_color/compressed, say
+        name = self.topics.color.split("/")
+        rectified = any(part.startswith("image_rect") for part in name)  # as ROS calls them
         return self._decode(raw, lambda message, _: decode_camera(message, rectified), what)
 
     def _decode(
