@@ -131,7 +131,7 @@ def _beside(index: Index) -> set[str]:
 
 def _first_camera(player: Player, reader: RecordingReader, start_ns: int) -> Camera | None:
     """Return the calibration in force at the start, which may be recorded after it."""
-    if player.topics.camera is None or player.settings.camera is not None:
+    if player.topics.camera is None:
         return None
     topic = {player.topics.camera}
     before = reader.messages(topic, 0, start_ns + 1) if start_ns else ()

@@ -84,7 +84,8 @@ class Player:
     ) -> None:
         self.settings = settings
         self.name = name
-        self.topics = topics
+        # Where a camera is given, that of the recording does not matter.
+        self.topics = topics if settings.camera is None else replace(topics, camera=None)
         self.beside = beside
         self.numbered = numbered
         self.counts = counts
@@ -125,8 +126,6 @@ class Player:
 
     def _take(self, raw: Raw, pairing: Pairing[_Color, _Depth]) -> Iterator[RgbdFrame]:
         if raw.channel.topic == self.topics.camera:
-            if self.settings.camera is not None:
-                return  # that of the recording does not matter
             self.camera = self.calibration(raw, "calibrations") or self.camera
         elif raw.channel.topic == self.topics.depth:
             depth = self._decode(raw, self._depth)
