@@ -25,11 +25,11 @@ class Durations:
         self._bins[round(100 * math.log(max(duration_ns, 1)))] += 1
 
     def quantile_ms(self, q: float) -> float:
-        """Return the q-quantile in ms, within 1 %; NaN without data."""
-        rank, seen = q * (self.count - 1), 0
+        """Return the q-quantile (nearest rank) in ms, within 1 %; NaN without data."""
+        seen = 0
         for key in sorted(self._bins):
             seen += self._bins[key]
-            if seen > rank:
+            if seen >= q * self.count:
                 return min(math.exp(key / 100), self.max_ns) / 1e6
         return math.nan
 

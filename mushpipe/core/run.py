@@ -70,6 +70,7 @@ class _Runner:
         self.late = 0
         self.failure: BaseException | None = None
         self.failures_in_a_row = 0
+        self.last_failed: StageError | None = None
         self.tolerance = 1
         self.started = time.monotonic()
         self.saved: set[str] = set()  # nodes with a failure capsule
@@ -221,6 +222,7 @@ class _Runner:
         if not isinstance(error, MushpipeError):
             self._save_capsule(node, frame, failed)
         self.report.failed += 1
+        self.last_failed = failed
         self.failures_in_a_row += 1
         if self.failures_in_a_row >= self.tolerance:
             many = f" ({self.failures_in_a_row} frames in a row)" if self.tolerance > 1 else ""
@@ -249,7 +251,15 @@ class _Runner:
                 self.report.error = self.report.error or thread.error
                 if thread.failed_frame is not None:
                     self._save_capsule(thread.node, thread.failed_frame, thread.error)
-        self.report.error = self.report.error or reader.error
+        self.report.error = self.report.error or reader.error or self._nothing_done()
+
+    def _nothing_done(self) -> StageError | None:
+        """Return what to say where frames were skipped and none was left."""
+        last = self.last_failed
+        if last is None or self.report.processed:
+            return None
+        text = f"none of {self.report.failed} frames could be processed; the last: {last}"
+        return StageError(text, last.exit_code)
 
     def _save_capsule(self, node: Node, frame: RgbdFrame, error: Exception) -> None:
         if self.capsules is None or node.name in self.saved:

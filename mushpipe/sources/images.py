@@ -66,6 +66,8 @@ def decode_color(message: Any) -> NDArray[np.uint8]:
     if message.encoding in _YUV:
         import cv2
 
+        if message.width % 2:
+            raise ValueError(f"{message.encoding} image of odd width {message.width}")
         rows = _pixels(message, 2).reshape(message.height, message.width, 2)
         return np.asarray(cv2.cvtColor(rows, getattr(cv2, _YUV[message.encoding])), np.uint8)
     if message.encoding not in _COLOR:

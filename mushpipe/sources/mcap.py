@@ -114,11 +114,10 @@ class McapSource(RecordedSource, ReplaySource):
             shift += last.sequence - first.sequence + 1
             span = last.stamp_ns - first.stamp_ns
             shift_ns += span + span // max(1, player.frames - 1) if span else 33_333_333
-        damage = [*reader.damage, *([player.error] if player.error else [])]
-        if damage:
-            raise InputError(
-                f"{self.path} is damaged: {'; '.join(damage)}; {delivered} frames could be read"
-            )
+        faults = [f"damaged: {text}" for text in reader.damage]
+        faults += [f"not all can be decoded: {player.error}"] if player.error else []
+        if faults:
+            raise InputError(f"{self.path}: {'; '.join(faults)}; {delivered} frames could be read")
         if not delivered:
             raise InputError(f"{self.path}: there is no frame in the chosen range")
 

@@ -198,6 +198,17 @@ def test_skipping_goes_on_and_counts(lab: Lab, caplog):
     )
 
 
+def test_a_skipping_run_that_got_nothing_done_has_failed(lab: Lab):
+    text = lab.chain("fussy", extra="on_error: skip").replace("fussy", "fussy, on: [0, 1]")
+    report = lab.run(text, "source.count=2")
+    assert counts(report) == (2, 0, 0, 2)
+    assert str(report.error) == (
+        "none of 2 frames could be processed; the last: "
+        "stage 'a' (fussy) failed on frame 1: RuntimeError: I do not like it"
+    )
+    assert report.exit_code == 1
+
+
 def test_too_many_failures_in_a_row_end_a_skipping_run(lab: Lab):
     text = lab.chain("fussy", extra="on_error: skip\nmax_failures: 3")
     report = lab.run(text.replace("fussy", "fussy, on: [0, 1, 3, 5, 6, 7]"), "source.count=20")

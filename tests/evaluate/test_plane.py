@@ -132,6 +132,9 @@ def test_a_calibration_needs_more_distances_than_its_order(tmp_path: Path) -> No
     found = fit_correction([row], 0)
     assert found.coefficients == pytest.approx([3, 0, 0], abs=0.1)
     assert found.left == pytest.approx([0])
+    far = measure_plane(plane(tmp_path, 0.51, 0.003, 0.001), 51.0, resamples=0)
+    with pytest.raises(UsageError, match=r"its depth says 0\.513 m, --plane 51 m"):
+        fit_correction([far], 0)
     with pytest.raises(UsageError, match="--order 1 needs 2 distances, there are 1"):
         fit_correction([row, row], 1)
 

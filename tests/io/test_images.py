@@ -229,11 +229,13 @@ def test_a_unit_from_the_user_makes_mono16_readable(tmp_path: Path) -> None:
         (raw_image(RGB, "bayer_rggb8"), "colour encoding 'bayer_rggb8' is not known (known: rgb8"),
         (raw_image(GRAY, "rgb8"), "8x6 image with step 8 in 48 bytes, rgb8 needs 3 bytes a pixel"),
         (raw_image(RGB, "rgb8", data=b""), "8x6 image with step 24 in 0 bytes"),
+        (raw_image(np.zeros((6, 7, 2), np.uint8), "yuv422"), "yuv422 image of odd width 7"),
     ],
 )
 def test_color_that_cannot_be_read_is_named(image: Any, message: str, tmp_path: Path) -> None:
     source = McapSource(path=write_bag(tmp_path, [(COLOR, T0, image)]))
     frames, error = drain(source)
     assert frames == []
-    assert f"{COLOR}: {message}" in str(error)
+    assert f"not all can be decoded: {COLOR}: {message}" in str(error)
+    assert "damaged" not in str(error)
     assert source.counts() == {"images that could not be decoded": 1}
