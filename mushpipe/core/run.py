@@ -251,15 +251,10 @@ class _Runner:
                 self.report.error = self.report.error or thread.error
                 if thread.failed_frame is not None:
                     self._save_capsule(thread.node, thread.failed_frame, thread.error)
-        self.report.error = self.report.error or reader.error or self._nothing_done()
-
-    def _nothing_done(self) -> StageError | None:
-        """Return what to say where frames were skipped and none was left."""
-        last = self.last_failed
-        if last is None or self.report.processed:
-            return None
-        text = f"none of {self.report.failed} frames could be processed; the last: {last}"
-        return StageError(text, last.exit_code)
+        self.report.error = self.report.error or reader.error
+        if (last := self.last_failed) and not self.report.processed:
+            text = f"none of {self.report.failed} frames could be processed; the last: {last}"
+            self.report.error = self.report.error or StageError(text, last.exit_code)
 
     def _save_capsule(self, node: Node, frame: RgbdFrame, error: Exception) -> None:
         if self.capsules is None or node.name in self.saved:
