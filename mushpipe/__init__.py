@@ -6,7 +6,7 @@ This module is what a plugin author needs.
 from mushpipe.core.errors import InputError, MushpipeError
 from mushpipe.core.geometry import Camera, quaternion_from_axis
 from mushpipe.core.plugins import Registry, hookimpl
-from mushpipe.core.stage import GraphPath, ReplaySource, RunInfo, Sink, Source, Stage
+from mushpipe.core.stage import GraphPath, ReplaySource, RunInfo, Sink, SinkPath, Source, Stage
 from mushpipe.core.tables import (
     Circles,
     Columns,
@@ -38,6 +38,7 @@ __all__ = [
     "RgbdFrame",
     "RunInfo",
     "Sink",
+    "SinkPath",
     "Source",
     "Stage",
     "Trace",

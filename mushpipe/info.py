@@ -146,7 +146,9 @@ def _settings(schema: dict[str, Any], prefix: str = "") -> list[tuple[str, ...]]
     rows: list[tuple[str, ...]] = []
     for key, field in schema.get("properties", {}).items():
         group = schema.get("$defs", {}).get(field.get("$ref", "").rpartition("/")[2])
-        default = "" if group else _default(field)
+        default = json.dumps(field["default"]) if "default" in field and not group else ""
+        if key in schema.get("required", ()):
+            default = "required"
         rows.append((prefix + key, _type(field), default, field.get("description", "")))
         if group:
             rows += _settings({**group, "$defs": schema["$defs"]}, f"{prefix}{key}.")
@@ -168,7 +170,3 @@ def _type(schema: dict[str, Any]) -> str:
         return str(schema["$ref"].rpartition("/")[2])
     bounds = [f" {sign} {schema[key]:g}" for key, sign in _BOUNDS.items() if key in schema]
     return str(schema.get("format", schema.get("type", "any"))) + "".join(bounds)
-
-
-def _default(schema: dict[str, Any]) -> str:
-    return json.dumps(schema["default"]) if "default" in schema else "required"

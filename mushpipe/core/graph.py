@@ -227,9 +227,18 @@ def _translate(
             top = len(item["loc"]) == 1
             problems.append(document.problem(path, what, suggest(name, known) if top else "", True))
         elif item["type"] == "missing":
-            problems.append(document.problem(path[:-1], f"setting '{name}'{of} is missing"))
+            problems.append(document.problem(path[:-1], _missing(item["loc"], of)))
         else:
-            given = json.dumps(item["input"], default=str)
-            message = f"{'.'.join(map(str, item['loc']))}{of}: {item['msg']}, got {given}"
-            problems.append(document.problem(path, message))
+            what = ".".join(map(str, item["loc"])) + of if item["loc"] else f"'{use}'"
+            given = f", got {json.dumps(item['input'], default=str)}" if item["loc"] else ""
+            message = item["msg"].removeprefix("Value error, ")
+            problems.append(document.problem(path, f"{what}: {message}{given}"))
     return problems
+
+
+def _missing(place: tuple[int | str, ...], of: str) -> str:
+    """Say that there is no setting, or no further value of a list, at a place."""
+    *above, last = map(str, place)
+    if isinstance(place[-1], int):
+        return f"{'.'.join(above)}{of}: value {place[-1] + 1} is missing"
+    return f"setting '{'.'.join([*above, last])}'{of} is missing"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import typing
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -36,6 +37,17 @@ def resolve_path(path: Path, info: ValidationInfo) -> Path:
 
 GraphPath = Annotated[Path, AfterValidator(resolve_path)]
 """A path setting: relative to the graph file, or to the shell where the command line set it."""
+
+
+def only_recording(path: Path) -> Path:
+    """Raise ValueError where braces of a sink's path hold anything but ``recording``."""
+    if unknown := set(re.findall(r"\{[^}]*\}", str(path))) - {"{recording}"}:
+        raise ValueError(f"{', '.join(sorted(unknown))} is not known: only {{recording}} is")
+    return path
+
+
+SinkPath = Annotated[GraphPath, AfterValidator(only_recording)]
+"""A path that a sink writes to; {recording} in it is the name of the input."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import ByteSize, Field, PrivateAttr
 
-from mushpipe import GraphPath, RunInfo, Sink, Trace
+from mushpipe import RunInfo, Sink, SinkPath, Trace
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.recording import MANIFEST, SUMMARY
 from mushpipe.core.stage import STDIO
@@ -25,7 +25,7 @@ class McapSink(Sink):
 
     delivery: ClassVar[Literal["every", "latest"]] = "every"
 
-    path: GraphPath = Field(description="file to write; {recording} is the name of the input")
+    path: SinkPath = Field(description="file to write; {recording} is the name of the input")
     frames: bool | Literal["source"] = Field(
         True,
         description="record colour and depth beside the results, also those that stages made; "

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 from urllib.parse import urlsplit
 
-from pydantic import Field, PrivateAttr
+from pydantic import Field, PrivateAttr, model_validator
 
-from mushpipe import GraphPath, Header, RunInfo, Sink, Trace
+from mushpipe import Header, RunInfo, Sink, SinkPath, Trace
 from mushpipe.core.errors import DependencyError, UsageError
 from mushpipe.core.transform import Transform
 
@@ -36,7 +36,7 @@ class RerunSink(Sink):
 
     delivery: ClassVar[Literal["every", "latest"]] = "latest"
 
-    save: GraphPath | None = Field(
+    save: SinkPath | None = Field(
         None, description=".rrd file to write; {recording} is the name of the input"
     )
     spawn: bool = Field(False, description="open a viewer on this machine's display")
@@ -70,6 +70,12 @@ class RerunSink(Sink):
     _last: Header | None = PrivateAttr(None)
     _base: Transform | None = PrivateAttr(None)
 
+    @model_validator(mode="after")
+    def _has_a_target(self) -> RerunSink:
+        if not (self.save or self.spawn or self.connect or self.serve):
+            raise ValueError("nothing to do: set 'save', 'spawn', 'connect' or 'serve'")
+        return self
+
     def files(self, run: RunInfo) -> tuple[Path, ...]:
         """Return the file it writes."""
         return (run.path(self.save),) if self.save else ()
@@ -78,7 +84,7 @@ class RerunSink(Sink):
         """Open the file and the ways to viewers.
 
         Raises:
-            UsageError: There is nothing to do, or nobody listens at `connect`.
+            UsageError: Nobody listens at `connect`.
             DependencyError: There is no display for `spawn`, or the server does not start.
         """
         import rerun as rr
@@ -89,8 +95,6 @@ class RerunSink(Sink):
         if self.save:
             sinks.append(rr.FileSink(str(run.path(self.save)), write_footer=self.index))
         sinks += [rr.GrpcSink(url) for url in self._viewers()]
-        if not sinks:
-            raise UsageError("nothing to do: set 'save', 'spawn', 'connect' or 'serve'")
         self._recording = rr.RecordingStream("mushpipe", recording_id=run.recording)
         self._recording.set_sinks(*sinks)
         graph = run.manifest.get("graph", {})

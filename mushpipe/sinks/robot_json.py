@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field, PrivateAttr
 
-from mushpipe import GraphPath, Picks, RunInfo, Sink, Trace
+from mushpipe import GraphPath, Picks, RunInfo, Sink, SinkPath, Trace
 from mushpipe.core.errors import EXIT_INTERRUPTED, EXIT_NO_DEVICE, EXIT_OK, UsageError
 from mushpipe.robot.abb import AbbSession
 from mushpipe.robot.clock import Clock, Placer
@@ -73,7 +73,7 @@ class RobotJsonSink(Sink):
     tls_client_ca: GraphPath | None = Field(
         None, description="clients must show a certificate signed by this one, PEM"
     )
-    transcript: GraphPath | None = Field(
+    transcript: SinkPath | None = Field(
         None, description="MCAP file for every line out and in; {recording} is the input's name"
     )
 

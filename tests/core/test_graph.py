@@ -7,10 +7,13 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mushpipe import Sink
 from mushpipe.core.document import Document, parse_document, read_document
 from mushpipe.core.errors import GraphError
 from mushpipe.core.graph import compile_document
 from mushpipe.core.plugins import load_registry
+from mushpipe.sinks.mcap import McapSink
+from mushpipe.sinks.rerun import RerunSink
 from tests.core.lab import Lab, cli
 
 KEYS = st.sampled_from(
@@ -231,8 +234,6 @@ def test_all_faults_are_reported_together_in_file_order(lab: Lab):
 
 
 def test_a_missing_setting_is_placed_at_its_plugin(lab: Lab):
-    from mushpipe import Sink
-
     class Needy(Sink):
         size: int
 
@@ -245,6 +246,27 @@ def test_a_missing_setting_is_placed_at_its_plugin(lab: Lab):
         "      out: {use: needy}\n"
         "           ^"
     )
+
+
+def test_a_value_that_a_list_lacks_is_counted(lab: Lab):
+    class Ranged(Sink):
+        span: tuple[float, float]
+
+        def consume(self) -> None:
+            """Take nothing."""
+
+    lab.registry.sink("ranged", Ranged)
+    graph = "mushpipe: 1\nsource: {use: frames}\nsinks:\n  out: {use: ranged, span: [8]}\n"
+    assert "span of 'ranged': value 2 is missing" in lab.faults(graph)
+
+
+def test_faults_that_a_plugin_finds_in_its_settings_are_told_before_a_run(lab: Lab):
+    lab.registry.sink("mcap", McapSink)
+    lab.registry.sink("rerun", RerunSink)
+    graph = "mushpipe: 1\nsource: {use: frames}\nsinks:\n"
+    assert "'rerun': nothing to do: set 'save'" in lab.faults(graph + "  a: {use: rerun}\n")
+    faults = lab.faults(graph + "  a: {use: mcap, path: 'out/{recoding}.mcap'}\n")
+    assert "path of 'mcap': {recoding} is not known: only {recording} is" in faults
 
 
 trees = st.recursive(

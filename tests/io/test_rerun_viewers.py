@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from rerun.chunk import RrdReader
 
 from mushpipe import Mask, RunInfo, Trace
@@ -129,8 +130,8 @@ def wait_for(port: int, listening: bool = True) -> None:
 
 
 def test_what_cannot_be_opened_is_refused_with_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(UsageError, match="set 'save', 'spawn', 'connect' or 'serve'"):
-        feed(RerunSink(), [])
+    with pytest.raises(ValidationError, match="set 'save', 'spawn', 'connect' or 'serve'"):
+        RerunSink()
     with pytest.raises(UsageError, match="no viewer answers at 127"):
         feed(RerunSink(connect=f"rerun+http://127.0.0.1:{free_port()}/proxy"), [])
     with pytest.raises(UsageError, match="is not like"):
