@@ -43,7 +43,7 @@ class CapNet(Stage):
         (8, 45), description="smallest and largest radius, px; the image is scaled to suit"
     )
     min_score: float = Field(
-        0.42, ge=0, le=1, description="smallest score that is kept; chosen on simulated beds"
+        0.37, ge=0, le=1, description="smallest score that is kept; chosen on simulated beds"
     )
     overlap: float = Field(0.4, ge=0, le=1, description="largest IoU of two circles")
     model: GraphPath | None = Field(None, description="another model than the package's, ONNX")

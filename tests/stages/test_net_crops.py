@@ -7,7 +7,7 @@ import pytest
 
 from mushpipe.core.truth import Ignore
 from mushpipe.stages.cap_decode import HEAT, MASK, circles_of
-from training.net.augment import aims, blackened, crop
+from training.net.augment import aims, blackened, blotched, crop, overexposed
 from training.net.scenes import Picture, settings
 
 DISCS = [(150.0, 120.0, 30.0), (300.5, 200.25, 18.0), (420.0, 330.0, 41.0)]
@@ -45,6 +45,18 @@ def test_circles_of_a_crop_lie_on_its_caps(seed: int) -> None:
     assert (target[MASK][disc] > 0.9).all()
 
 
+def test_stains_change_images_and_never_targets() -> None:
+    changed = 0
+    for seed in range(8):
+        plain, stained = (
+            crop(picture(), 224, np.random.default_rng(seed), stained=s) for s in (False, True)
+        )
+        changed += bool((plain[0] != stained[0]).any())
+        assert (plain[1] == stained[1]).all()
+        assert (plain[2] == stained[2]).all()
+    assert changed
+
+
 def test_a_stump_is_no_cap_and_a_hidden_cap_is_not_asked_for() -> None:
     stumps = [crop(picture(Ignore.CUT_STUMP), 224, np.random.default_rng(k)) for k in range(4)]
     assert not any((target[HEAT] > 0).any() for _, target, _ in stumps)
@@ -65,6 +77,25 @@ def test_a_raised_black_point_leaves_caps_brighter_than_the_soil(seed: int) -> N
     assert dark.min() >= 0
     assert dark[cap == 0].mean() < image[cap == 0].mean()
     assert dark[cap > 0].mean() > 5 * dark[cap == 0].mean()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_blotches_stay_within_what_they_are_laid_on(seed: int) -> None:
+    image = np.full((64, 64, 3), 0.5, np.float32)
+    cap = np.zeros((64, 64), np.float32)
+    cap[16:48, 16:48] = 1
+    blotchy = blotched(image, cap, np.random.default_rng(seed))
+    assert (blotchy[cap == 0] == 0.5).all()
+    assert blotchy[cap > 0].std(axis=0).max() > 0.01
+    assert (blotchy > 0).all()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_overexposure_only_brightens_and_by_one_factor(seed: int) -> None:
+    image = np.random.default_rng(seed).uniform(0.1, 0.3, (40, 40, 3)).astype(np.float32)
+    ratio = overexposed(image, np.ones((40, 40), np.float32), np.random.default_rng(seed)) / image
+    assert ratio == pytest.approx(ratio[0, 0, 0])
+    assert ratio[0, 0, 0] * np.median(image) >= 0.7 - 1e-6
 
 
 def test_drawn_settings_are_ones_the_simulator_takes_and_of_family_a() -> None:

@@ -16,7 +16,11 @@ HIDDEN = 0.3  # nor are those of which less is seen
 
 
 def crop(
-    picture: Picture, size: int, rng: np.random.Generator, near: float = 0.0
+    picture: Picture,
+    size: int,
+    rng: np.random.Generator,
+    near: float = 0.0,
+    stained: bool = False,
 ) -> tuple[Singles, Singles, Singles]:
     """Return an image (3, size, size) in 0..1, its target (5, h, w) and weight (h, w).
 
@@ -25,6 +29,7 @@ def crop(
         size: px, a multiple of 32.
         rng: Draws everything.
         near: Share of the crops that are taken around a cap; the others lie anywhere.
+        stained: Whether caps and bed may be blotched, overexposed, and set one against the other.
     """
     matrix, scale = _placement(picture, size, rng, near)
     color = cv2.warpAffine(
@@ -32,7 +37,8 @@ def crop(
         borderValue=rng.integers(0, 256, 3).tolist(),
     )  # fmt: skip
     cap = cv2.warpAffine(picture.cap.astype(np.float32), matrix, (size, size))
-    image = photographed(np.asarray(color, np.float32) / 255, np.asarray(cap, np.float32), rng)
+    image, cap = np.asarray(color, np.float32) / 255, np.asarray(cap, np.float32)
+    image = photographed(image, cap, rng, stained)
     center = picture.circles[:, :2] @ matrix[:, :2].T + matrix[:, 2]
     circles = np.column_stack([center, picture.circles[:, 2] * scale])
     stump = picture.kind == Ignore.CUT_STUMP
@@ -92,11 +98,15 @@ def aims(
     return target, weight
 
 
-def photographed(image: Singles, cap: Singles, rng: np.random.Generator) -> Singles:
+def photographed(
+    image: Singles, cap: Singles, rng: np.random.Generator, stained: bool = False
+) -> Singles:
     """Return an image (H, W, 3) with other colours, light, blur, noise and things before it."""
     if rng.random() < 0.4:  # other caps on the same bed
         gain = np.exp(rng.uniform(-0.8, 0.3) + rng.normal(0, 0.12, 3)).astype(np.float32)
         image = image * (1 + cap[..., None] * (gain - 1))
+    if stained:
+        image = _stained(image, cap, rng)
     if rng.random() < 0.3:  # gaps between caps are black in contrasty pictures
         image = blackened(image, cap, rng)
     image = image * np.exp(rng.normal(0, 0.08, 3)).astype(np.float32)
@@ -106,6 +116,8 @@ def photographed(image: Singles, cap: Singles, rng: np.random.Generator) -> Sing
     image = image * _light(image.shape[0], rng)[..., None]
     image = image * np.float32(np.exp(rng.normal(0, 0.3))) + np.float32(rng.normal(0, 0.03))
     image = image * np.float32(max(1.0, rng.uniform(0.04, 0.2) / max(image.mean(), 1e-3)))
+    if stained and rng.random() < 0.2:
+        image = overexposed(image, cap, rng)
     image = _patches(image, rng)
     if rng.random() < 0.4:
         image = cv2.GaussianBlur(image, (0, 0), rng.uniform(0.3, 1.5))
@@ -113,6 +125,39 @@ def photographed(image: Singles, cap: Singles, rng: np.random.Generator) -> Sing
         rng.exponential(0.015)
     )
     return np.asarray(np.clip(image, 0, 1), np.float32)
+
+
+def _stained(image: Singles, cap: Singles, rng: np.random.Generator) -> Singles:
+    """Give caps another bed, and both of them blotches."""
+    if rng.random() < 0.3:
+        gain = np.exp(rng.uniform(-0.3, 1.2) + rng.normal(0, 0.1, 3)).astype(np.float32)
+        image = image * (1 + (1 - cap)[..., None] * (gain - 1))
+    if rng.random() < 0.35:  # scales, stains and bruises
+        image = blotched(image, cap, rng)
+    if rng.random() < 0.2:  # so blotches alone make no cap
+        image = blotched(image, 1 - cap, rng)
+    return image
+
+
+def blotched(image: Singles, where: Singles, rng: np.random.Generator) -> Singles:
+    """Blotch what lies in `where` (H, W) 0..1, more in some places than in others."""
+    size = image.shape[0]
+
+    def smooth(cells: int) -> Singles:
+        field = rng.standard_normal((cells, cells), np.float32)
+        return np.asarray(cv2.resize(field, (size, size), interpolation=cv2.INTER_CUBIC))
+
+    fine = smooth(int(size / rng.uniform(3, 16)))
+    amount = 1 / (1 + np.exp(-np.float32(rng.uniform(2, 6)) * fine - 3 * smooth(5)))
+    gain = np.exp(rng.uniform(-0.9, 0.3) + rng.normal(0, 0.15, 3)).astype(np.float32)
+    return np.asarray(image * (1 + (where * amount)[..., None] * (gain - 1)), np.float32)
+
+
+def overexposed(image: Singles, cap: Singles, rng: np.random.Generator) -> Singles:
+    """Brighten the image until a part of the caps, or most of them, is white."""
+    inside = image[cap > 0.9]
+    usual = float(np.median(inside)) if len(inside) else 0.5
+    return image * np.float32(max(1.0, rng.uniform(0.7, 2) / max(usual, 0.05)))
 
 
 def blackened(image: Singles, cap: Singles, rng: np.random.Generator) -> Singles:

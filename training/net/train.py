@@ -24,14 +24,14 @@ SIZE, BATCH, RATE, DECAY = 224, 8, 2.5e-3, 0.998
 class Crops:
     """Batches from the frames, with a generator of their own."""
 
-    def __init__(self, frames: list[Picture], seed: int, near: float) -> None:
+    def __init__(self, frames: list[Picture], seed: int, near: float, stained: bool) -> None:
         self._frames, self._rng = frames, np.random.default_rng([seed, 9])
-        self._near = near
+        self._near, self._stained = near, stained
 
     def batch(self) -> tuple[torch.Tensor, ...]:
         """Return images, targets and weights."""
         picks = self._rng.integers(len(self._frames), size=BATCH)
-        rows = [crop(self._frames[k], SIZE, self._rng, self._near) for k in picks]
+        rows = [crop(self._frames[k], SIZE, self._rng, self._near, self._stained) for k in picks]
         return tuple(torch.from_numpy(np.stack(part)) for part in zip(*rows, strict=True))
 
 
@@ -87,6 +87,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=5000)
     parser.add_argument("--rate", type=float, default=RATE, help="largest learning rate")
     parser.add_argument("--near", type=float, default=0.0, help="share of crops around a cap")
+    parser.add_argument("--stained", action="store_true", help="blotched and overexposed as well")
     parser.add_argument("--start", type=Path, help="weights to go on from")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("out/net/cap-net.pt"))
@@ -97,7 +98,7 @@ def main() -> None:
     net = CapNet()
     if arguments.start:
         net.load_state_dict(torch.load(arguments.start))
-    crops = Crops(frames, arguments.seed, arguments.near)
+    crops = Crops(frames, arguments.seed, arguments.near, arguments.stained)
     train(net, crops, arguments.steps, arguments.rate, arguments.out)
 
 
