@@ -46,7 +46,7 @@ def only_recording(path: Path) -> Path:
     return path
 
 
-SinkPath = Annotated[GraphPath, AfterValidator(only_recording)]
+SinkPath = Annotated[Path, AfterValidator(only_recording), AfterValidator(resolve_path)]
 """A path that a sink writes to; {recording} in it is the name of the input."""
 
 
