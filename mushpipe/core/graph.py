@@ -220,25 +220,20 @@ def _translate(
     problems = []
     of = f" of '{use}'" if use else ""
     for item in error.errors():
-        path = (*at, *item["loc"])
+        path, place = (*at, *item["loc"]), ".".join(map(str, item["loc"]))
         name = str(item["loc"][-1]) if item["loc"] else ""
         if item["type"] == "extra_forbidden":
             what = f"unknown setting '{name}'{of}"
             top = len(item["loc"]) == 1
             problems.append(document.problem(path, what, suggest(name, known) if top else "", True))
         elif item["type"] == "missing":
-            problems.append(document.problem(path[:-1], _missing(item["loc"], of)))
+            text = f"setting '{place}'{of} is missing"
+            if isinstance(last := path[-1], int):  # of a list
+                text = f"{place.rpartition('.')[0]}{of}: value {last + 1} is missing"
+            problems.append(document.problem(path[:-1], text))
         else:
-            what = ".".join(map(str, item["loc"])) + of if item["loc"] else f"'{use}'"
-            given = f", got {json.dumps(item['input'], default=str)}" if item["loc"] else ""
+            what = place + of if place else f"'{use}'"
+            given = f", got {json.dumps(item['input'], default=str)}" if place else ""
             message = item["msg"].removeprefix("Value error, ")
             problems.append(document.problem(path, f"{what}: {message}{given}"))
     return problems
-
-
-def _missing(place: tuple[int | str, ...], of: str) -> str:
-    """Say that there is no setting, or no further value of a list, at a place."""
-    *above, last = map(str, place)
-    if isinstance(place[-1], int):
-        return f"{'.'.join(above)}{of}: value {place[-1] + 1} is missing"
-    return f"setting '{'.'.join([*above, last])}'{of} is missing"
