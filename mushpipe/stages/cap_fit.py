@@ -19,10 +19,11 @@ from mushpipe import (
 )
 from mushpipe.stages.cap_batch import Fits, fit_caps
 from mushpipe.stages.cap_solve import Noise
-from mushpipe.stages.surface_fit import HOLE_M, sources
+from mushpipe.stages.surface_fit import fit_tops, sources, variance_along, without_tip
 from mushpipe.stages.upright import Up, pixel_rays, upright
 
 Floats = NDArray[np.float64]
+LEAST = 8  # points that a surface over a hole needs
 
 
 class CapFit(Stage):
@@ -30,8 +31,8 @@ class CapFit(Stage):
 
     Eight parameters are fitted to block means of the depth, along their rays; to the depth edge and
     the circle, which touch the cap; and to what caps are like. Nearer mushrooms' circles hide what
-    they cover. Where tilt cannot be seen the sigma says so. A mushroom with hardly any depth is
-    ``missing`` and has no pose.
+    they cover. Over a hole at the centre the position is that of `surface-fit`. Where tilt cannot
+    be seen the sigma says so. A mushroom with hardly any depth is ``missing`` and has no pose.
     """
 
     up: Up = "bed"
@@ -77,7 +78,11 @@ class CapFit(Stage):
             )
         depth = np.fmax(frame.depth_m, np.float32(0))  # missing: 0 in place of NaN
         fits = self.fit(frame.gray, depth, frame.camera, circles)
-        return _locations(fits, circles, depth), _poses(fits)
+        source = np.where(fits.valid, sources(circles, depth), DepthSource.MISSING)
+        holes = np.flatnonzero(source == DepthSource.NEIGHBOURS)
+        if len(holes):
+            self._bridge(holes, fits, depth, frame.camera, circles)
+        return _locations(fits, source.astype(np.uint8)), _poses(fits)
 
     def fit(
         self,
@@ -119,16 +124,35 @@ class CapFit(Stage):
             (noise, sensor, self.outline_sigma_px, self.min_points),
         )
 
+    def _bridge(
+        self,
+        holes: NDArray[np.intp],
+        fits: Fits,
+        depth: NDArray[np.float32],
+        camera: Camera,
+        circles: Circles,
+    ) -> None:
+        """Put the surface over holes at a centre, as `surface-fit` does: spheroids have no tip."""
+        discs = np.column_stack([circles.center, circles.radius])
+        noise = (self.depth_noise_mm / 1000, self.depth_noise_per_m / 1000)
+        surface, covariance, _ = fit_tops(depth, camera, discs, noise, LEAST, holes)
+        rows = holes[np.isfinite(surface[holes, 0])]
+        tops, discs = (surface[rows], covariance[rows]), discs[rows]
+        focal = (camera.fx + camera.fy) / 2
+        z = tops[0][:, 0] - self.depth_bias_mm / 1000
+        size, pixel = discs[:, 2] * z / focal, self.circle_sigma_px * z / focal
+        along = variance_along(without_tip(*tops)[0], tops[1], size, pixel)
+        fits.surface[rows] = camera.deproject(discs[:, :2], z)
+        fits.sigma_surface[rows, 2] = np.maximum(fits.sigma_surface[rows, 2], np.sqrt(along))
 
-def _locations(fits: Fits, circles: Circles, depth: NDArray[np.float32]) -> Locations:
-    source = sources(circles, depth)
-    hidden = np.where(source == DepthSource.NEIGHBOURS, HOLE_M, 0)
+
+def _locations(fits: Fits, source: NDArray[np.uint8]) -> Locations:
     return Locations(
         position=fits.surface,
         distance=np.linalg.norm(fits.surface, axis=1),
         diameter=2 * fits.radius,
-        source=np.where(fits.valid, source, DepthSource.MISSING).astype(np.uint8),
-        sigma_position=np.hypot(fits.sigma_surface, hidden[:, None] * [0, 0, 1]),
+        source=source,
+        sigma_position=fits.sigma_surface,
         sigma_diameter=2 * fits.sigma_radius,
     )
 

@@ -12,13 +12,16 @@ from mushpipe.stages.cap_order import rank_by_depth
 from mushpipe.stages.cap_samples import CELLS, GRID, block, ray_at
 
 Floats = NDArray[np.float64]
-COEFFICIENTS = 6
+COEFFICIENTS = 7
+TIP = 6  # the coefficient that says how pointed a cap is
 ROUNDS = 4
 DISC = 0.6  # points within so many radii; farther out a cap falls off faster than a paraboloid
 EFFECTIVE = 0.5  # as in cap-fit: so much of a point's information is its own
-SHAPE_M = 0.0004  # sigma of a cap about a paraboloid
+SHAPE_M = 0.00025  # sigma of a cap about such a surface
 BEND = 0.3  # sigma of the quadratic coefficients about those of a cap, in radii
 ASPECT = 0.62  # height of a dome over the radius of its rim
+POINTED = 0.2  # sigma of the slope of a pointed top, less in its innermost BLUNT radii
+BLUNT = 0.15
 INNER = CELLS[(CELLS**2).sum(axis=1) < DISC**2]
 
 
@@ -26,20 +29,24 @@ INNER = CELLS[(CELLS**2).sum(axis=1) < DISC**2]
 def fit_surfaces(
     image: Any,
     discs: Floats,
+    rows: NDArray[np.intp],
     focal: float,
     noise: tuple[float, float],
     least: int,
     out: tuple[Floats, Floats],
 ) -> NDArray[np.int64]:
-    """Fit z = b0 + b1 x + b2 y + b3 x^2 + b4 x y + b5 y^2 to every cap, x and y in its radii.
+    """Fit z = b0 + b1 x + b2 y + b3 x^2 + b4 x y + b5 y^2 + b6 q to caps, x and y in their radii.
+
+    q = sqrt(x^2 + y^2 + BLUNT^2) - BLUNT is the tip of a pointed cap: a cone with a blunt end.
 
     Args:
         image: Depth (H, W) m, rays (H, W, 2), and ranks (H, W) full of N.
         discs: (N, 3) x, y, radius, px.
+        rows: (M,) which of them are fitted.
         focal: Focal length, px.
         noise: Sigma of depth is noise[0] + noise[1] z, m.
         least: Fewest points.
-        out: Coefficients (N, 6) m and covariances (N, 6, 6); those without a fit stay as they are.
+        out: Coefficients (N, 7) m and covariances (N, 7, 7); those without a fit stay as they are.
 
     Returns:
         (N, 2) how many points of the whole grid have depth of the cap, and how many other depth.
@@ -47,7 +54,7 @@ def fit_surfaces(
     rank = rank_by_depth(image[0], discs, image[2])
     near = np.empty((COEFFICIENTS + 2, len(INNER)))
     seen = np.zeros((len(discs), 2), np.int64)
-    for i in range(len(discs)):
+    for i in rows:
         n, middle = sample_inner(image, rank[i], discs[i], focal, noise, near)
         size = discs[i, 2] * middle / focal
         if n >= least and paraboloid(near[:, :n], size, out[0][i], out[1][i]):
@@ -69,7 +76,7 @@ def sample_inner(
         disc: (3,) x, y, radius, px.
         focal: Focal length, px.
         noise: Sigma of depth.
-        out: (8, M) out: the six terms of the paraboloid, depth about the middle (m), variance.
+        out: (9, M) out: the seven terms of the surface, depth about the middle (m), variance.
 
     Returns:
         Number of points, and the middle depth (m), 0 without any.
@@ -102,9 +109,10 @@ def sample_inner(
         y = (ray[1] / ray[2] - center[1] / center[2]) * focal / disc[2]
         out[0, m], out[1, m], out[2, m] = 1.0, x, y
         out[3, m], out[4, m], out[5, m] = x * x, x * y, y * y
-        out[6, m] = z - middle
+        out[TIP, m] = np.sqrt(x * x + y * y + BLUNT * BLUNT) - BLUNT
+        out[7, m] = z - middle
         # part of the noise is shared by neighbouring pixels
-        out[7, m] = (sigma * (0.3 + 0.7 / np.sqrt(counts[j]))) ** 2 + SHAPE_M * SHAPE_M
+        out[8, m] = (sigma * (0.3 + 0.7 / np.sqrt(counts[j]))) ** 2 + SHAPE_M * SHAPE_M
         m += 1
     return m, middle
 
@@ -129,10 +137,10 @@ def paraboloid(points: Floats, size: float, surface: Floats, covariance: Floats)
     """Fit one paraboloid by least squares with Tukey's weights; False where it is not determined.
 
     Args:
-        points: (8, M) the six terms, depth about a middle one (m) and its variance.
+        points: (9, M) the seven terms, depth about a middle one (m) and its variance.
         size: Radius of the cap, m: the scale of what bends are expected.
-        surface: (6,) out.
-        covariance: (6, 6) out.
+        surface: (7,) out.
+        covariance: (7, 7) out.
     """
     count = points.shape[1]
     weighted, right = np.empty((COEFFICIENTS, count)), np.empty(COEFFICIENTS)
@@ -141,21 +149,21 @@ def paraboloid(points: Floats, size: float, surface: Floats, covariance: Floats)
         for j in range(count):
             error = 0.0  # all count alike at first
             if k > 0:
-                error = points[6, j]
+                error = points[COEFFICIENTS, j]
                 for i in range(COEFFICIENTS):
                     error -= surface[i] * points[i, j]
-            rest = max(1.0 - error * error / (cut * points[7, j]), 0.0)
-            weight = EFFECTIVE * rest * rest / points[7, j]
+            rest = max(1.0 - error * error / (cut * points[COEFFICIENTS + 1, j]), 0.0)
+            weight = EFFECTIVE * rest * rest / points[COEFFICIENTS + 1, j]
             for i in range(COEFFICIENTS):
                 weighted[i, j] = weight * points[i, j]
         for i in range(COEFFICIENTS):
-            right[i] = dot(weighted[i], points[6], count)
+            right[i] = dot(weighted[i], points[COEFFICIENTS], count)
             for m in range(i + 1):
                 covariance[i, m] = covariance[m, i] = dot(weighted[i], points[m], count)
         for i in range(3, COEFFICIENTS):
-            known = 1.0 / (BEND * size) ** 2
+            known = 1.0 / ((BEND if i < 6 else POINTED) * size) ** 2
             covariance[i, i] += known
-            right[i] += known * (0.5 * ASPECT * size if i != 4 else 0.0)
+            right[i] += known * (0.5 * ASPECT * size if i == 3 or i == 5 else 0.0)
         if not invert(covariance):
             surface[:], covariance[:] = np.nan, np.nan
             return False

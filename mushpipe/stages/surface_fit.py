@@ -1,4 +1,4 @@
-"""Position and diameter of each cap from a paraboloid around its centre; no model of the cap."""
+"""Position and diameter of each cap from the surface around its centre; no model of the cap."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pydantic import Field
 
 from mushpipe import Camera, Circles, DepthSource, InputError, Locations, RgbdFrame, Stage
 from mushpipe.stages.cap_samples import ASTRAY, CELLS
-from mushpipe.stages.paraboloid import ASPECT, COEFFICIENTS, SHAPE_M, fit_surfaces
+from mushpipe.stages.paraboloid import ASPECT, COEFFICIENTS, SHAPE_M, TIP, fit_surfaces
 from mushpipe.stages.upright import pixel_rays
 
 Floats = NDArray[np.float64]
@@ -16,17 +16,16 @@ ASPECT_SIGMA = 0.15
 LIP = 0.25  # what is below the rim's plane, over its radius
 OUTLINE = 0.008  # sigma of a cap's diameter about that of its outline, relative
 WHOLE = 0.85  # share of the grid that finds depth on a cap which nothing hides
-HOLE_M = 0.0004  # sigma of what a hole at the centre hides: the tip of a pointed cap
 STEEPEST = np.radians(60)
-SLOPE = np.radians(10)  # sigma of the tilt that a slope shows: caps are neither even nor round
+SLOPE = np.radians(12)  # sigma of the tilt that a slope shows: caps are neither even nor round
 SPREAD = np.radians(15)  # of the tilts in a bed about what they have in common, per direction
 
 
 class SurfaceFit(Stage):
-    """Fits a paraboloid to the depth around each circle's centre: position and diameter with sigma.
+    """Fits a paraboloid with a tip to the depth around each circle's centre.
 
-    The position is the paraboloid's at the centre, also where depth is missing just there. The
-    diameter is the circle's at the depth of the rim, put right for the tilt that the paraboloid's
+    The position is that surface's at the centre, also where depth is missing just there. The
+    diameter is the circle's at the depth of the rim, put right for the tilt that the surface's
     slope shows. Nearer mushrooms' circles hide what they cover. A mushroom with hardly any depth
     is ``missing``.
     """
@@ -42,7 +41,7 @@ class SurfaceFit(Stage):
         """Compile the kernels."""
         depth = np.full((48, 64), 0.4, np.float32)
         camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
-        self.fit(depth, camera, np.array([[32.0, 24.0, 9.0]]))
+        fit_tops(depth, camera, np.array([[32.0, 24.0, 9.0]]), (0.001, 0.001), 8)
 
     def process(self, frame: RgbdFrame, circles: Circles) -> Locations:
         """Return one location per circle.
@@ -59,19 +58,18 @@ class SurfaceFit(Stage):
             )
         depth = np.fmax(frame.depth_m, np.float32(0))  # missing: 0 in place of NaN
         discs = np.column_stack([circles.center, circles.radius])
-        surface, covariance, seen = self.fit(depth, frame.camera, discs)
+        noise = (self.depth_noise_mm / 1000, self.depth_noise_per_m / 1000)
+        surface, covariance, seen = fit_tops(depth, frame.camera, discs, noise, self.min_points)
         focal = (frame.camera.fx + frame.camera.fy) / 2
         pixel = self.circle_sigma_px * surface[:, 0] / focal  # its sigma on the cap, m
         size = circles.radius * surface[:, 0] / focal
-        slope = surface[:, 1:3] / size[:, None]
+        smooth = without_tip(surface, covariance)
         ray = frame.camera.deproject(circles.center, np.ones(len(circles)))
         position = ray * surface[:, :1]
         own, other = seen.T
-        source = sources(circles, depth)
-        along = covariance[:, 0, 0] + SHAPE_M**2 + (slope**2).sum(axis=1) * pixel**2
-        along += np.where(source == DepthSource.NEIGHBOURS, HOLE_M**2, 0)
+        along = variance_along(smooth[0], covariance, size, pixel)
         along += np.where(other > ASTRAY * (own + other), size**2, 0)
-        diameter, sigma_diameter = diameters(surface, covariance, size, ray)
+        diameter, sigma_diameter = diameters(*smooth, size, ray)
         # what is hidden of an outline was guessed by the detector
         whole = np.minimum(own / (WHOLE * len(CELLS)), 1) ** 2
         sigma_diameter = np.hypot(sigma_diameter, 2 * pixel) / np.maximum(whole, 1e-3)
@@ -80,29 +78,61 @@ class SurfaceFit(Stage):
             position=position,
             distance=np.linalg.norm(position, axis=1),
             diameter=diameter,
-            source=np.where(known, source, DepthSource.MISSING),
+            source=np.where(known, sources(circles, depth), DepthSource.MISSING),
             sigma_position=np.column_stack([pixel, pixel, np.sqrt(along)]),
             sigma_diameter=sigma_diameter,
         )
 
-    def fit(
-        self, depth: NDArray[np.float32], camera: Camera, discs: Floats
-    ) -> tuple[Floats, Floats, NDArray[np.int64]]:
-        """Return coefficients (N, 6), m, covariances (N, 6, 6) and numbers of points (N, 2).
 
-        Args:
-            depth: (H, W) m, 0 = missing, finite.
-            camera: Intrinsics.
-            discs: (N, 3) x, y, radius, px.
-        """
-        n = len(discs)
-        image = (depth, pixel_rays(camera), np.full(depth.shape, n, np.int16))
-        noise = (self.depth_noise_mm / 1000, self.depth_noise_per_m / 1000)
-        surface = np.full((n, COEFFICIENTS), np.nan)
-        covariance = np.full((n, COEFFICIENTS, COEFFICIENTS), np.nan)
-        focal = (camera.fx + camera.fy) / 2
-        seen = fit_surfaces(image, discs, focal, noise, self.min_points, (surface, covariance))
-        return surface, covariance, seen
+def fit_tops(
+    depth: NDArray[np.float32],
+    camera: Camera,
+    discs: Floats,
+    noise: tuple[float, float],
+    least: int,
+    rows: NDArray[np.intp] | None = None,
+) -> tuple[Floats, Floats, NDArray[np.int64]]:
+    """Return coefficients (N, 7), m, covariances (N, 7, 7) and numbers of points (N, 2).
+
+    Args:
+        depth: (H, W) m, 0 = missing, finite.
+        camera: Intrinsics.
+        discs: (N, 3) x, y, radius, px.
+        noise: Sigma of depth at the camera, m, and its growth, m per m.
+        least: Fewest points.
+        rows: (M,) which are fitted, all unless given; the others are NaN, but hide what they cover.
+    """
+    n = len(discs)
+    image = (depth, pixel_rays(camera), np.full(depth.shape, n, np.int16))
+    surface = np.full((n, COEFFICIENTS), np.nan)
+    covariance = np.full((n, COEFFICIENTS, COEFFICIENTS), np.nan)
+    focal = (camera.fx + camera.fy) / 2
+    chosen = np.arange(n) if rows is None else rows
+    seen = fit_surfaces(image, discs, chosen, focal, noise, least, (surface, covariance))
+    return surface, covariance, seen
+
+
+def without_tip(surface: Floats, covariance: Floats) -> tuple[Floats, Floats]:
+    """Return surfaces (N, 7) and covariances (N, 7, 7) under the condition that none is pointed.
+
+    In noisy depth a tip looks much like a bend; slope and bend scatter less without one.
+    """
+    gain = covariance[:, :, TIP] / covariance[:, TIP, TIP, None]
+    shared = gain[:, :, None] * covariance[:, None, TIP]
+    return surface - gain * surface[:, TIP, None], covariance - shared
+
+
+def variance_along(surface: Floats, covariance: Floats, size: Floats, pixel: Floats) -> Floats:
+    """Return the variances (N,) m^2 of the depths at the centres of circles.
+
+    Args:
+        surface: (N, 7) coefficients, m.
+        covariance: (N, 7, 7) of those with a tip.
+        size: (N,) radius of the circle at the depth of its centre, m.
+        pixel: (N,) sigma of the centre there, m.
+    """
+    slope = surface[:, 1:3] / size[:, None]
+    return np.asarray(covariance[:, 0, 0] + SHAPE_M**2 + (slope**2).sum(axis=1) * pixel**2)
 
 
 def sources(circles: Circles, depth: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -126,8 +156,8 @@ def diameters(
     a R (x^2 + y^2) / 2, x and y in radii, and its slope is (1 - a^2) of the tilt.
 
     Args:
-        surface: (N, 6) coefficients of the paraboloid, m.
-        covariance: (N, 6, 6).
+        surface: (N, 7) coefficients without a tip, m.
+        covariance: (N, 7, 7).
         size: (N,) radius of the circle at the depth of its centre, m.
         ray: (N, 3) ray of the centre at z = 1.
     """

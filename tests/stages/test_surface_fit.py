@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mushpipe import Camera, Circles, DepthSource, InputError, Locations, RgbdFrame
+from mushpipe.sim.shapes import CapShape, Warp, dome
 from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.paraboloid import invert
 from mushpipe.stages.surface_fit import SurfaceFit
@@ -53,6 +54,30 @@ def test_a_hole_at_the_centre_moves_nothing_and_is_said() -> None:
     assert found.source.tolist() == [DepthSource.NEIGHBOURS] * 4
     assert found.position[:, 2] == pytest.approx(whole.position[:, 2], abs=2e-4)
     assert (found.sigma_position[:, 2] > whole.sigma_position[:, 2]).all()
+
+
+@pytest.mark.parametrize("stage", [SurfaceFit(), CapFit(up="camera")])
+@pytest.mark.parametrize(
+    ("form", "high"), [((0.2, 0.3), 0.9), ((0.32, 0.42), 0.6), ((0.9, 0.9), 0.6)]
+)
+def test_a_tip_lost_in_a_hole(
+    stage: SurfaceFit | CapFit, form: tuple[float, float], high: float
+) -> None:
+    """Conical and flat caps of the simulator, 40 mm, upright in the middle of the image."""
+    top, rim = 0.46, 0.02
+    rho, z = dome(CapShape("b", high, form, 0.2, 0.2, True, Warp()), 200)
+    across, along = rim * rho, top + rim * (high - z)
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    off = np.hypot((u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy)
+    edge = rim / along[-1]
+    depth = np.where(off < edge, np.interp(off, across / along, along), BED)
+    depth[off < 0.2 * edge] = np.nan
+    middle = np.array([[CAMERA.cx, CAMERA.cy]])
+    circle = Circles(middle, np.array([CAMERA.fx * edge]), np.ones(1))
+    found = stage.process(frame_from(depth, GRAY), circle)
+    place = found if isinstance(found, Locations) else found[0]
+    assert place.source.tolist() == [DepthSource.NEIGHBOURS]
+    assert abs(place.position[0, 2] - top) < min(0.0012, 2 * place.sigma_position[0, 2])
 
 
 def test_depth_on_the_soil_alone_is_missing_never_a_number() -> None:
