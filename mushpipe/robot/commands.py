@@ -171,8 +171,9 @@ def replay(
 ) -> None:
     """Play a recorded transcript against a server or a client, printing every line.
 
-    To a client every message says that it is a replay.
+    To a client every message says that it is a replay. Ends with 4 where the file is damaged.
     """
+    from mushpipe.core.errors import InputError
     from mushpipe.robot.replay import as_client, as_server, lines_of
 
     def show(sign: str, text: bytes) -> None:
@@ -183,7 +184,7 @@ def replay(
 
     if (connect is None) == (listen is None):
         raise typer.BadParameter("give either --connect or --listen")
-    lines = lines_of(file, client)
+    lines, damage = lines_of(file, client)
     try:
         if connect is not None:
             as_client(lines, *_split(connect), show)
@@ -192,3 +193,8 @@ def replay(
     except OSError as error:
         _note(f"{connect or 'the client'}: {error}")
         raise typer.Exit(1) from None
+    if damage:
+        raise InputError(
+            f"{file} is damaged: {'; '.join(damage)}; the {len(lines)} lines that could be read "
+            "were played"
+        )

@@ -18,19 +18,22 @@ Show = Callable[[str, bytes], None]
 SILENCE_S = 15.0
 
 
-def lines_of(path: Path, client: int | None = None) -> list[Line]:
+def lines_of(path: Path, client: int | None = None) -> tuple[list[Line], list[str]]:
     """Return one client's lines, by default those of the first client that said anything.
+
+    And, in words, what of the file is damaged.
 
     Raises:
         InputError: There is no such client.
     """
-    everything = [line for line in read_transcript(path) if line.kind != "event"]
+    everything, damage = read_transcript(path)
+    said = [line for line in everything if line.kind != "event"]
     if client is None:
-        client = next((line.client for line in everything if line.kind == "rx"), None)
-    found = [line for line in everything if line.client == client]
+        client = next((line.client for line in said if line.kind == "rx"), None)
+    found = [line for line in said if line.client == client]
     if not found:
         raise InputError(f"{path}: there is no such client in this transcript")
-    return found
+    return found, damage
 
 
 def as_client(lines: Iterable[Line], host: str, port: int, show: Show) -> int:

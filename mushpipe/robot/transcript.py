@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import logging
 import threading
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -134,8 +133,8 @@ class Transcript:
             logger.warning("%d lines are missing from the robot's transcript", self.lost)
 
 
-def read_transcript(path: Path) -> Iterator[Line]:
-    """Yield the lines of a transcript in the order they were sent and received.
+def read_transcript(path: Path) -> tuple[list[Line], list[str]]:
+    """Return the lines of a transcript in the order they were sent, and what of it is damaged.
 
     Raises:
         UsageError: There is no such file.
@@ -143,7 +142,8 @@ def read_transcript(path: Path) -> Iterator[Line]:
     """
     kinds: dict[str, Kind] = {f"{PREFIX}{kind}": kind for kind in ("tx", "rx", "event")}
     found: list[tuple[int, Line]] = []
-    for raw in RecordingReader(path).messages(set(kinds)):
+    reader = RecordingReader(path)
+    for raw in reader.messages(set(kinds)):
         body = orjson.loads(raw.message.data)
         text = body["line"].encode()
         if body["encoding"] == "base64":
@@ -151,6 +151,7 @@ def read_transcript(path: Path) -> Iterator[Line]:
         kind = kinds[raw.channel.topic]
         found.append((body["sequence"], Line(kind, body["client"], text, body["monotonic_ns"])))
     if not found:
-        raise InputError(f"{path}: there is no transcript of a robot in it")
+        why = f"; the file is damaged: {'; '.join(reader.damage)}" if reader.damage else ""
+        raise InputError(f"{path}: there is no transcript of a robot in it{why}")
     # File order follows the wall clock, which may have jumped; the sequence is the truth.
-    yield from (line for _, line in sorted(found, key=lambda entry: entry[0]))
+    return [line for _, line in sorted(found, key=lambda entry: entry[0])], reader.damage

@@ -12,6 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from mushpipe.cli import app
+from mushpipe.core.errors import InputError
 from mushpipe.robot import commands
 from mushpipe.robot.client import RobotClient
 from tests.robot.scene import bench
@@ -85,6 +86,18 @@ def test_a_transcript_is_replayed(tmp_path: Path) -> None:
         assert '"effect":"removed"' in done.output
     assert robot("replay", path, "--connect", f"127.0.0.1:{b.port}").exit_code == 1
     assert robot("replay", path).exit_code == 2
+
+
+def test_a_damaged_transcript_is_replayed_as_far_as_it_goes(tmp_path: Path) -> None:
+    path = tmp_path / "robot.mcap"
+    record(path)
+    path.write_bytes(path.read_bytes()[:-100])
+    with bench() as b:
+        b.publish()
+        done = robot("replay", path, "--connect", f"127.0.0.1:{b.port}")
+    assert "> \\xff\\xfe" in done.output
+    assert isinstance(done.exception, InputError)
+    assert f"{path} is damaged: it breaks off" in str(done.exception)
 
 
 def test_a_transcript_answers_a_client(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
