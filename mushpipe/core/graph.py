@@ -186,7 +186,9 @@ def _node(
         )
     except ValidationError as error:
         problems += _translate(document, at, error, list(_settings(plugin_class)), use)
-        return None
+        # never run, but its ports say whether it is wired
+        unset = plugin_class.model_construct()
+        return Node(str(at[-1]), kind, use, unset, ports, dict(inputs), delivery)
     if ".py:" in use:
         use = str((base / use).resolve())
     attributes = _settings(plugin_class)

@@ -233,6 +233,18 @@ def test_all_faults_are_reported_together_in_file_order(lab: Lab):
     ]
 
 
+def test_a_faulty_setting_does_not_hide_that_an_input_is_missing(lab: Lab):
+    text = lab.faults("""
+        mushpipe: 1
+        source: {use: frames}
+        stages:
+          a: {use: threshold, level: x}
+          b: {use: invert, inputs: {mask: aa}}
+    """)
+    assert "4:30: level of 'threshold'" in text
+    assert "5:35: there is no stage 'aa'; did you mean 'a'?" in text
+
+
 def test_a_missing_setting_is_placed_at_its_plugin(lab: Lab):
     class Needy(Sink):
         size: int
