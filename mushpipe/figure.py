@@ -53,9 +53,10 @@ def draw_stages(trace: Trace) -> Figure:
 
 
 def draw_localization(trace: Trace) -> Figure:
-    """Draw depth (blue) and distance (red), m, as measured at the centres and as estimated.
+    """Draw depth (blue) and distance (red), m, as recorded at the centres and as located.
 
-    The left image shows NaN where the centre has no depth, the right one what stands in for it.
+    The left image shows NaN where the centre has no depth, the right one what stands in for it,
+    and depth as stages corrected it.
 
     Raises:
         UsageError: The frame has no depth, no circles or no locations.
@@ -72,8 +73,8 @@ def draw_localization(trace: Trace) -> Figure:
         points = frame.camera.deproject(circles.center, depth)
         distance = np.linalg.norm(points, axis=1)
     pairs = (
-        ("depth (blue) and distance (red) at the centres, m", depth, distance),
-        ("estimated where there is none", locations.position[:, 2], locations.distance),
+        ("recorded: depth (blue) and distance (red) at the centres, m", depth, distance),
+        ("located: an estimate where there is none", locations.position[:, 2], locations.distance),
     )
     panels = [
         Panel(title, frame.color, partial(_pairs, circles=circles, depth=z, distance=d))
@@ -236,4 +237,7 @@ def _text(axes: Axes, x: float, y: float, text: str, color: str) -> None:
     from matplotlib.patheffects import withStroke
 
     outline = [withStroke(linewidth=1.6, foreground="white")]
+    # the centre of a circle over the border may lie beyond it
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()[::-1]
+    x, y = min(max(x, left), right), min(max(y, low), high)
     axes.text(x, y, text, color=color, fontsize=6, ha="center", va="center", path_effects=outline)
