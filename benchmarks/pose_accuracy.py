@@ -2,8 +2,8 @@
 
     python benchmarks/pose_accuracy.py --family b --seeds 5000:5006
 
-One row per set and method: tilt error in degrees (angle between axes, no absolute value that would
-hide a flip), mean z^2 of the stated sigmas, and the rest in mm.
+One row per set and method, and one for all sets together: tilt error in degrees (angle between
+axes, no absolute value that would hide a flip), mean z^2 of the stated sigmas, the rest in mm.
 """
 
 from __future__ import annotations
@@ -112,6 +112,11 @@ class Tally:
             ])
         )  # fmt: skip
 
+    def take(self, other: Tally) -> None:
+        """Take in what another one has."""
+        self.rows += other.rows
+        self.missing += other.missing
+
     def row(self) -> str:
         """Return the table's row."""
         tilt, s_tilt, apex, size, s_size, z, s_z, seen = np.concatenate(self.rows).T
@@ -159,6 +164,7 @@ def main() -> None:
         ),
     }
     print(HEAD)
+    pooled = {method: Tally() for method in methods}
     for name in options.sets.split(","):
         tallies = {method: Tally() for method in methods}
         for seed in range(first, last):
@@ -177,6 +183,10 @@ def main() -> None:
         for method, tally in tallies.items():
             if tally.rows:
                 print(f"{name:9s} {method:22s} {tally.row()}", flush=True)
+                pooled[method].take(tally)
+    for method, tally in pooled.items():
+        if tally.rows and "," in options.sets:
+            print(f"{'all':9s} {method:22s} {tally.row()}")
 
 
 if __name__ == "__main__":
