@@ -68,9 +68,9 @@ class Passage:
     durations_ns: dict[str, int] = field(default_factory=dict)
     failed: tuple[Node, BaseException] | None = None
 
-    def trace(self) -> Trace:
+    def trace(self, left_ns: int) -> Trace:
         """Return what the sinks get."""
-        return Trace(self.frame, self.outputs, self.durations_ns)
+        return Trace(self.frame, self.outputs, self.durations_ns, left_ns)
 
 
 class Chain:

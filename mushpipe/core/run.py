@@ -207,7 +207,7 @@ class _Runner:
             if passage.durations_ns:  # a recorder has no stages whose time could be told
                 self.report.frame.add(sum(passage.durations_ns.values()))
             self.report.latency.add(time.perf_counter_ns() - left_ns)
-            trace = passage.trace()
+            trace = passage.trace(left_ns)
             for thread in threads:
                 thread.box.put((passage.frame, sink_inputs(thread.node, trace)))
         self.report.read = reader.box.accepted

@@ -6,7 +6,15 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+)
 
 from mushpipe.core.stage import resolve_path
 from mushpipe.core.tables import Floats
@@ -76,10 +84,16 @@ def _read(value: Any, info: ValidationInfo) -> Any:
 
     path = resolve_path(Path(value), info)
     try:
-        return Transform.model_validate_json(json.dumps(read_document(path).data))
+        return Transform.model_validate_json(json.dumps(read_document(path).data), strict=True)
     except (GraphError, ValueError) as error:
+        what = str(error)
+        if isinstance(error, ValidationError):
+            first = error.errors(include_url=False)[0]
+            what = (
+                f"{'.'.join(map(str, first['loc']))}: {first['msg'].removeprefix('Value error, ')}"
+            )
         raise ValueError(
-            f"no transform in {path}: {error}; expected frame, translation: [x, y, z] in m and "
+            f"no transform in {path}: {what}; expected frame, translation: [x, y, z] in m and "
             "quaternion: [x, y, z, w]"
         ) from error
 

@@ -136,8 +136,11 @@ class Trace:
         frame: The frame as the source delivered it.
         outputs: Per stage, in graph order, its outputs.
         durations_ns: Per stage, the wall time it took.
+        left_ns: When the frame left its source, ns of ``time.perf_counter_ns``; None of a frame
+            that nobody plays now.
     """
 
     frame: RgbdFrame
     outputs: Mapping[str, tuple[Any, ...]]
     durations_ns: Mapping[str, int]
+    left_ns: int | None = None

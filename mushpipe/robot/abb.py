@@ -9,7 +9,7 @@ from __future__ import annotations
 import hmac
 import re
 
-from mushpipe.robot.hub import Ending, Hub, Result
+from mushpipe.robot.hub import Ending, Hub, Result, ceil_ms
 from mushpipe.robot.ledger import Outcome
 from mushpipe.robot.messages import NAME, Refusal
 from mushpipe.robot.session import Outgoing
@@ -87,7 +87,7 @@ class AbbSession:
         most = self._hub.settings.max_age_s
         limit = min(most, _positive(words[1]) / 1000) if len(words) > 1 else most
         result = self._hub.fresh(now, limit)
-        age = self._hub.age_ms(now) or 0
+        age = ceil_ms(max(0.0, now - result.taken))
         return self._best(result, age) or f"NONE,{age}", result.taken + limit
 
     def _best(self, result: Result, age_ms: int) -> str | None:

@@ -46,8 +46,8 @@ def _note(text: str) -> None:
 
 def _split(address: str) -> tuple[str, int]:
     host, colon, port = address.rpartition(":")
-    if not (colon and host and port.isdecimal()):
-        raise typer.BadParameter(f"'{address}' is not host:port")
+    if not (colon and host and port.isdecimal() and 0 < int(port) < 65536):
+        raise typer.BadParameter(f"'{address}' is not host:port, with a port from 1 to 65535")
     return host, int(port)
 
 
@@ -165,7 +165,8 @@ def replay(
         str | None, typer.Option(help="host:port of a server: play the client to it")
     ] = None,
     listen: Annotated[
-        int | None, typer.Option(help="port on loopback: play the server to one client")
+        int | None,
+        typer.Option(help="port on loopback: play the server to one client", min=0, max=65535),
     ] = None,
     client: Annotated[int | None, typer.Option(help="whose lines; default the first's")] = None,
 ) -> None:

@@ -26,6 +26,7 @@ class Settings:
     stall_s: float = 1.0
     client_timeout_s: float = 10.0
     claim_s: float = 60.0
+    max_targets: int = 200
     replay: bool = False
     token: str = ""
     software: str = "mushpipe"
@@ -117,7 +118,7 @@ class Hub:
     def age_ms(self, now: float) -> int | None:
         """Return the age of the newest result, rounded up; None where nobody knows it."""
         age = max(0.0, now - self.newest.taken) if self.newest else float("inf")
-        return None if age == float("inf") else _ceil_ms(age)
+        return None if age == float("inf") else ceil_ms(age)
 
     def envelope(self, now: float) -> dict[str, Any]:
         """Return what stands in every message."""
@@ -155,7 +156,7 @@ class Hub:
             "status": "ok",
             "frame_number": result.frame_number,
             "stamp": {"sec": result.stamp_ns // 10**9, "nsec": result.stamp_ns % 10**9},
-            "age_ms": _ceil_ms(age),
+            "age_ms": ceil_ms(age),
             "valid_ms": max(0, math.floor(round((limit - age) * 1000, 3))),
             "frame": result.choice.frame,
             **self.envelope(now),
@@ -164,19 +165,26 @@ class Hub:
         }
         return orjson.dumps(head)[:-1] + body
 
-    def offered(self, result: Result) -> list[Target]:
+    def free(self, result: Result) -> list[Target]:
         """Return the targets nobody has claimed, best first."""
         hidden = self.ledger.hidden()
         return [target for target in result.choice.targets if target.id not in hidden]
+
+    def offered(self, result: Result) -> list[Target]:
+        """Return the first of them, as many as may be sent."""
+        return self.free(result)[: self.settings.max_targets]
 
     def _body(self, result: Result, most: int) -> tuple[bytes, dict[Reason, int], bool]:
         """Encode what is the same for every client, once."""
         key = (result.seq, self.ledger.version, most)
         if self._cache is None or self._cache[0] != key:
-            offered = self.offered(result)
+            free, offered = self.free(result), self.offered(result)
             sent = offered[:most]
-            claimed = len(result.choice.targets) - len(offered)
-            withheld: dict[Reason, int] = {**result.choice.withheld, "claimed": claimed}
+            withheld: dict[Reason, int] = {
+                **result.choice.withheld,
+                "claimed": len(result.choice.targets) - len(free),
+                "limit": len(free) - len(offered),
+            }
             listed = b",".join(target.json for target in sent)
             body = b',"count":%d,"targets":[%s]}\n' % (len(sent), listed)
             self._cache = (key, body, withheld, len(sent) < len(offered))
@@ -195,6 +203,7 @@ class Hub:
         return self.ledger.apply(owner, target, outcome, hold_s, visible, now)
 
 
-def _ceil_ms(seconds: float) -> int:
+def ceil_ms(seconds: float) -> int:
+    """Return whole milliseconds, rounded up."""
     # What a float adds to a whole number of milliseconds is not worth another one.
     return math.ceil(round(seconds * 1000, 3))

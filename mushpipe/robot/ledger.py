@@ -66,6 +66,8 @@ class Ledger:
             raise Refusal("unknown_target", f"m{target} is neither visible nor accepted")
         if entry is not None and entry.owner != owner:
             raise Refusal("conflict", f"m{target} is held by another robot")
+        if entry is not None and entry.done:
+            return "removed"  # for good, whatever is said later
         self.version += 1
         if outcome in ("accepted", "done") or hold_s > 0:
             if entry is None and len(self._entries) >= MOST_ENTRIES:

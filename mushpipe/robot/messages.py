@@ -137,6 +137,9 @@ def parse(line: bytes) -> Inbound:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         place = ".".join(str(part) for part in first["loc"][1:])
+        if first["loc"][1:2] == ("id",):  # of a union, whose parts are named as they are written
+            text = "id: expected a whole number from 0 to 2^53 - 1 or at most 64 characters"
+            raise Refusal("bad_request", text, **known) from None
         raise Refusal("bad_request", f"{place}: {first['msg']}", **known) from None
 
 

@@ -89,7 +89,10 @@ class RobotServer:
             sock.listen(16)
         except OSError as error:
             where = f"{listener.host}:{listener.port}"
-            raise UsageError(f"cannot listen on {where}: {error.strerror or error}") from error
+            raise UsageError(
+                f"cannot listen on {where}: {error.strerror or error}; choose another port or "
+                "address for the robots, or end the program that has this one"
+            ) from error
         sock.setblocking(False)
         self._selector.register(sock, selectors.EVENT_READ, listener)
 

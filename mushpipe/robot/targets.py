@@ -102,19 +102,16 @@ class Filter:
         self,
         allow_estimated: bool = False,
         workspace: Workspace | None = None,
-        limit: int = 200,
     ) -> None:
         self._allow_estimated = allow_estimated
         self._workspace = workspace
-        self._limit = limit
 
     def __call__(self, picks: Picks) -> Choice:
         """Return what may be sent of one frame's picks."""
         table = _Table(picks)
         with np.errstate(all="ignore"):
             left, withheld = self._sieve(table)
-            withheld["limit"] = max(0, len(left) - self._limit)
-            return Choice(table.frame, _targets(table, left[: self._limit]), withheld)
+            return Choice(table.frame, _targets(table, left), withheld)
 
     def _sieve(self, table: _Table) -> tuple[NDArray[np.intp], dict[Reason, int]]:
         bad: dict[Reason, Bools] = {

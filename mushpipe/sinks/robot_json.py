@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 import ssl
+import time
 from collections.abc import Mapping
 from importlib.metadata import version
 from ipaddress import ip_address
@@ -17,7 +18,7 @@ from mushpipe import GraphPath, Picks, RunInfo, Sink, SinkPath, Trace
 from mushpipe.core.errors import EXIT_INTERRUPTED, EXIT_NO_DEVICE, EXIT_OK, UsageError
 from mushpipe.robot.abb import AbbSession
 from mushpipe.robot.clock import Clock, Placer
-from mushpipe.robot.connection import Limits
+from mushpipe.robot.connection import Kind, Limits
 from mushpipe.robot.hub import Ending, Hub, Settings
 from mushpipe.robot.server import Listener, Opener, Options, RobotServer
 from mushpipe.robot.session import JsonSession
@@ -110,26 +111,30 @@ class RobotJsonSink(Sink):
             )
         self._live = run.live
         self._placer = Placer(self._clock)
-        self._filter = Filter(self.allow_estimated, self.workspace, self.max_targets)
+        self._filter = Filter(self.allow_estimated, self.workspace)
         hub = Hub(self._settings(run.live, token), self._clock, run.frames_read)
         options = Options(
             self._listeners(), Limits(lines_per_s=self.lines_per_s), self.max_clients, tls
         )
+        # Listening comes first: what cannot begin must not empty the transcript of another run.
+        self._server = RobotServer(hub, options, self._observe)
         if self.transcript:
             self._transcript = Transcript(run.path(self.transcript), self._clock, token)
-            self._server = RobotServer(hub, options, self._transcript.observe)
-        else:
-            self._server = RobotServer(hub, options)
         self._server.start()
         ports = " and ".join(map(str, self._server.ports))
         kind = "live" if run.live else "a recording, marked as such"
         logger.info("robots are served at %s, port %s: %s", self.bind, ports, kind)
+
+    def _observe(self, kind: Kind, client: int, text: bytes) -> None:
+        if self._transcript is not None:
+            self._transcript.observe(kind, client, text)
 
     def _settings(self, live: bool, token: str) -> Settings:
         return Settings(
             max_age_s=self.max_age_ms / 1000,
             stall_s=self.stall_ms / 1000,
             claim_s=self.claim_s,
+            max_targets=self.max_targets,
             replay=not live,
             token=token,
             software=f"mushpipe {version('mushpipe')}",
@@ -182,10 +187,11 @@ class RobotJsonSink(Sink):
 
         Of a recording only the time since it was played can be told, and that is its age.
         """
-        header, now = trace.frame.header, self._clock.monotonic()
-        processed = now - sum(trace.durations_ns.values()) / 1e9
+        header, played = trace.frame.header, self._clock.monotonic()
+        if trace.left_ns is not None:
+            played -= (time.perf_counter_ns() - trace.left_ns) / 1e9
         if not self._live or self._placer is None:
-            return processed
+            return played
         same_clock = 0 <= header.arrival_ns - header.stamp_ns <= SAME_CLOCK_NS
         placed = self._placer.place(header.stamp_ns if same_clock else header.arrival_ns)
         if placed is None:
@@ -193,7 +199,7 @@ class RobotJsonSink(Sink):
                 self._warned = True
                 logger.warning("the camera's time stamps are not of this host: robots get nothing")
             return float("-inf")
-        return min(placed, processed) - self.sensor_latency_ms / 1000
+        return min(placed, played) - self.sensor_latency_ms / 1000
 
     def finish(self, summary: Mapping[str, Any]) -> None:
         """Note how the run ended, for the robots' last word."""

@@ -6,6 +6,7 @@ import json
 import logging
 import os
 import select
+import stat
 import threading
 from collections import Counter
 from collections.abc import Iterator
@@ -47,8 +48,9 @@ class StreamSource(RecordedSource):
 
     @property
     def live(self) -> bool:
-        """Whether the sender has a camera; known once the stream is open."""
-        return self._manifest.get("live") == "true"
+        """Whether the sender has a camera; known once the stream is open. A file has none."""
+        saved = stat.S_ISREG(os.fstat(self._number).st_mode)
+        return self._manifest.get("live") == "true" and not saved
 
     def name(self) -> str:
         """Return ``stream``."""

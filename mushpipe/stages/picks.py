@@ -16,6 +16,7 @@ from mushpipe.stages.surroundings import clearance, hidden_share
 from mushpipe.stages.tracks import Tracks
 
 logger = logging.getLogger("mushpipe")
+SMALLEST_MM = 1.0
 Rank = Literal["unoccluded", "highest", "largest", "score"]
 FlagName = Literal[
     "depth_missing",
@@ -69,11 +70,14 @@ class MakePicks(Stage):
     def _range(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
         if value is not None and not 0 <= value[0] < value[1]:
             raise ValueError("expected the smallest and the largest diameter, mm")
+        if value is not None and value[1] < SMALLEST_MM:
+            raise ValueError("no mushroom is so small; it is in mm, not in m")
         return value
 
     _tracks: Tracks = PrivateAttr(default_factory=Tracks)
     _total: int = PrivateAttr(0)
     _missing: int = PrivateAttr(0)
+    _left_out: int = PrivateAttr(0)
 
     def open(self) -> None:
         """Compile the kernels."""
@@ -112,7 +116,9 @@ class MakePicks(Stage):
         if self.T_base_camera is not None:
             picks = in_base(picks, self.T_base_camera)
             up = picks.surface[:, 2]
-        return picks.take(self._chosen(picks, up, hidden))
+        chosen = self._chosen(picks, up, hidden)
+        self._left_out += n - len(chosen)
+        return picks.take(chosen)
 
     def _flags(
         self,
@@ -158,7 +164,14 @@ class MakePicks(Stage):
         return np.asarray(order[keep[order]])
 
     def close(self) -> None:
-        """Say how many mushrooms a robot could not have reached."""
+        """Say how many mushrooms a robot was not told of, or could not have reached."""
+        if self._left_out:
+            logger.warning(
+                "%d of %d mushrooms are left out of the picks by 'min_score', 'diameter_mm' or "
+                "'withhold'",
+                self._left_out,
+                self._total,
+            )
         if self._missing:
             logger.warning(
                 "%d of %d mushrooms have no position: there is no depth at them",

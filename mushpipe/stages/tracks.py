@@ -81,7 +81,8 @@ class Tracks:
         ids[fresh] = self._next + np.arange(len(fresh))
         self._next += len(fresh)
         unseen = np.setdiff1d(np.arange(len(old)), columns)
-        unseen = unseen[stamp_ns - old.seen_ns[unseen] <= memory_ns]
+        # where stamps go back, nobody knows for how long it was not seen
+        unseen = unseen[np.abs(stamp_ns - old.seen_ns[unseen]) <= memory_ns]
         self._known = _joined(replace(new, id=ids), old.take(unseen))
         return ids
 

@@ -7,6 +7,7 @@ import pty
 import tempfile
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -39,10 +40,17 @@ def stream(path: Path, frames: int, live: bool = False, depth: bool = True) -> P
     return path
 
 
-def source_of(path: Path) -> type[StreamSource]:
+def source_of(path: Path, piped: bool = False) -> type[StreamSource]:
+    def feed(end: int) -> None:
+        with suppress(BrokenPipeError), os.fdopen(end, "wb") as pipe:
+            pipe.write(path.read_bytes())
+
     class FromFile(StreamSource):
         def open(self) -> None:
             self._number = os.open(path, os.O_RDONLY)
+            if piped:
+                self._number, end = os.pipe()
+                threading.Thread(target=feed, args=(end,), daemon=True).start()
             super().open()
 
         def close(self) -> None:
@@ -57,13 +65,21 @@ def opened(path: Path, **settings: object) -> StreamSource:
     return source
 
 
+@pytest.mark.parametrize("piped", [True, False])
+def test_what_a_camera_sent_is_live_until_it_is_saved(tmp_path: Path, piped: bool) -> None:
+    source = source_of(stream(tmp_path / "s.mcap", 1, live=True), piped)()
+    source.open()
+    assert source.live == piped
+    source.close()
+
+
 @pytest.mark.parametrize("live", [True, False])
 def test_of_a_camera_the_newest_frame_is_taken_of_a_recording_every_one(
     lab: Lab, tmp_path: Path, live: bool
 ) -> None:
     entered, release = threading.Event(), threading.Event()
 
-    class Sender(source_of(stream(tmp_path / "s.mcap", 9, live))):  # type: ignore[misc]
+    class Sender(source_of(stream(tmp_path / "s.mcap", 9, live), piped=True)):  # type: ignore[misc]
         def frames(self) -> Iterator[RgbdFrame]:
             for i, frame in enumerate(super().frames()):
                 yield frame

@@ -157,9 +157,3 @@ def test_whatever_comes_every_target_is_finite_and_fits_the_schema(
     decoded(choice)
     assert len(choice.targets) + sum(choice.withheld.values()) == 4
     assert all(np.isfinite(target.row).all() for target in choice.targets)
-
-
-def test_only_the_best_are_kept_when_there_are_too_many() -> None:
-    choice = Filter(limit=2)(make_picks(5))
-    assert ids(choice) == [0, 1]
-    assert choice.withheld["limit"] == 3

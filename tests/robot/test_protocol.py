@@ -162,6 +162,31 @@ def test_a_picked_target_is_done_even_when_it_is_gone_from_sight() -> None:
         assert peer.ask("ack", id=2, target="m0", result="done")["op"] == "acked"
 
 
+def test_what_is_done_is_removed_for_good_whatever_is_said_later() -> None:
+    with bench(claim_s=5) as b, Peer(b.port) as peer:
+        b.publish()
+        peer.greet()
+        for number, result in enumerate(("done", "accepted", "failed")):
+            answer = peer.ask("ack", id=number, target="m0", result=result)
+            assert answer["effect"] == "removed"
+        b.advance(6)
+        b.publish()
+        assert peer.targets() == ["m1", "m2"]
+
+
+def test_where_only_some_may_be_sent_the_next_ones_follow_those_that_are_claimed() -> None:
+    with bench(max_targets=2) as b, Peer(b.port) as peer:
+        b.publish()
+        peer.greet()
+        answer = peer.ask("get_targets", id=1)
+        assert [target["id"] for target in answer["targets"]] == ["m0", "m1"]
+        assert (answer["withheld"]["limit"], answer["more"]) == (1, False)
+        peer.ask("ack", id=2, target="m0", result="accepted")
+        answer = peer.ask("get_targets", id=3)
+        assert [target["id"] for target in answer["targets"]] == ["m1", "m2"]
+        assert (answer["withheld"]["claimed"], answer["withheld"]["limit"]) == (1, 0)
+
+
 def test_two_robots_never_hold_one_target() -> None:
     with bench() as b, Peer(b.port) as one, Peer(b.port) as two:
         b.publish()

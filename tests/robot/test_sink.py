@@ -32,6 +32,14 @@ def frame_at(stamp_ns: int, arrival_ns: int = 0) -> RgbdFrame:
     return RgbdFrame(header, np.zeros((4, 4, 3), np.uint8))
 
 
+NOW_NS = 10**15  # of the clock that tells when frames left their source
+
+
+@pytest.fixture(autouse=True)
+def still(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(robot_json.time, "perf_counter_ns", lambda: NOW_NS)
+
+
 @pytest.fixture
 def sink() -> Iterator[RobotJsonSink]:
     sink = RobotJsonSink(port=0)
@@ -46,8 +54,8 @@ def port(sink: RobotJsonSink) -> int:
 
 
 def consume(sink: RobotJsonSink, stamp_ns: int, arrival_ns: int = 0, spent_s: float = 0) -> None:
-    durations = {"locate": round(spent_s * 1e9)}
-    sink.consume(make_picks(), Trace(frame_at(stamp_ns, arrival_ns), {}, durations))
+    left_ns = NOW_NS - round(spent_s * 1e9)
+    sink.consume(make_picks(), Trace(frame_at(stamp_ns, arrival_ns), {}, {}, left_ns))
 
 
 def ages(sink: RobotJsonSink, *frame: Any) -> int | None:

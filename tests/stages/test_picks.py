@@ -157,6 +157,20 @@ def test_what_is_not_wanted_is_left_out() -> None:
         picked(BED, diameter_mm=(60, 35))
 
 
+def test_the_end_of_a_run_says_how_many_were_left_out(caplog: pytest.LogCaptureFixture) -> None:
+    stage = MakePicks(withhold=("depth_missing",))
+    found = locations(DepthSource.MISSING, DepthSource.MEASURED)
+    stage.process(frame_of(np.zeros((120, 160))), circles_at((50, 50), (80, 50)), found)
+    with caplog.at_level(logging.WARNING, "mushpipe"):
+        stage.close()
+    assert "1 of 2 mushrooms are left out of the picks" in caplog.text
+
+
+def test_diameters_in_metres_are_refused() -> None:
+    with pytest.raises(ValueError, match="in mm, not in m"):
+        MakePicks(diameter_mm=(0.02, 0.06))
+
+
 def test_every_flag_can_be_withheld() -> None:
     for flag in PickFlag:
         assert flag.name is not None

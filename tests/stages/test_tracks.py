@@ -88,6 +88,14 @@ def test_an_id_survives_a_gap_within_the_memory_and_is_never_used_again() -> Non
     assert ids(tracks, here, at=40) == [2]
 
 
+def test_an_id_does_not_outlive_stamps_that_go_back() -> None:
+    here, elsewhere = (50, 50, 0.5), (90, 90, 0.5)
+    tracks = Tracks()
+    assert ids(tracks, here, at=1000) == [0]
+    assert ids(tracks, elsewhere, at=10) == [1]
+    assert ids(tracks, here, at=12) == [2]
+
+
 def test_a_jump_of_more_than_half_a_radius_is_another_mushroom() -> None:
     tracks = Tracks()
     ids(tracks, (50, 50, 0.5))
