@@ -169,6 +169,12 @@ def replay(
         typer.Option(help="port on loopback: play the server to one client", min=0, max=65535),
     ] = None,
     client: Annotated[int | None, typer.Option(help="whose lines; default the first's")] = None,
+    accept_replay: Annotated[
+        bool, typer.Option("--accept-replay", help="with --connect: take a recording's targets")
+    ] = False,
+    token_file: Annotated[
+        Path | None, typer.Option(help="with --connect: file with the server's token")
+    ] = None,
 ) -> None:
     """Play a recorded transcript against a server or a client, printing every line.
 
@@ -188,7 +194,9 @@ def replay(
     lines, damage = lines_of(file, client)
     try:
         if connect is not None:
-            as_client(lines, *_split(connect), show)
+            hello: dict[str, Any] = {"accept_replay": True} if accept_replay else {}
+            hello |= {} if token_file is None else {"token": token_file.read_text().strip()}
+            as_client(lines, *_split(connect), show, hello)
         else:
             as_server(lines, listen or 0, show, listening)
     except OSError as error:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 import socket
-from collections.abc import Callable, Iterable, Iterator
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,10 @@ from mushpipe.robot.transcript import Line, read_transcript
 Show = Callable[[str, bytes], None]
 """Is told of every line: ``>`` what we send, ``<`` what we get."""
 SILENCE_S = 15.0
+_REFUSAL = orjson.dumps({
+    "op": "error", "id": None, "code": "replay_refused", "fatal": True, "replay": True,
+    "message": "this is a recording; a client that wants it says accept_replay",
+})  # fmt: skip
 
 
 def lines_of(path: Path, client: int | None = None) -> tuple[list[Line], list[str]]:
@@ -36,21 +42,51 @@ def lines_of(path: Path, client: int | None = None) -> tuple[list[Line], list[st
     return found, damage
 
 
-def as_client(lines: Iterable[Line], host: str, port: int, show: Show) -> int:
-    """Send what the client sent, at once, and show the answers; return how many came."""
+def as_client(
+    lines: Iterable[Line], host: str, port: int, show: Show, hello: Mapping[str, Any] | None = None
+) -> int:
+    """Send what the client sent, at once, and show the answers; return how many came.
+
+    Args:
+        lines: The transcript.
+        host: Of the server.
+        port: Of the server.
+        show: Is told of every line.
+        hello: Fields that the client's hello has instead of its own, such as a token.
+
+    Raises:
+        OSError: The server cannot be reached, or ends the conversation with an error.
+    """
+    said = [line.text for line in lines if line.kind == "rx"]
     with socket.create_connection((host, port), SILENCE_S) as sock:
-        for line in lines:
-            if line.kind == "rx":
-                show(">", line.text)
-                sock.sendall(line.text + b"\n")
-        # The server answers what it has got, then closes in its turn.
-        sock.shutdown(socket.SHUT_WR)
-        count = 0
+        sender = threading.Thread(target=_say, args=(sock, said, hello or {}, show), daemon=True)
+        sender.start()
+        count, last = 0, b""
         with sock.makefile("rb") as answers:
             for answer in answers:
-                show("<", answer.rstrip(b"\n"))
+                last = answer.rstrip(b"\n")
+                show("<", last)
                 count += 1
+        sender.join()
+    if b'"fatal":true' in last:
+        raise ConnectionError("the server ended the conversation: see its last line")
     return count
+
+
+def _say(sock: socket.socket, said: list[bytes], hello: Mapping[str, Any], show: Show) -> None:
+    """Say everything; answers are read meanwhile, for a server does not wait with them."""
+    with suppress(OSError):  # it has hung up; its last line says why
+        for text in said:
+            line = orjson.dumps({**orjson.loads(text), **hello}) if _is_hello(text) else text
+            show(">", text)
+            sock.sendall(line + b"\n")
+        # The server answers what it has got, then closes in its turn.
+        sock.shutdown(socket.SHUT_WR)
+
+
+def _is_hello(line: bytes) -> bool:
+    body = _object(line)
+    return body is not None and body.get("op") == "hello"
 
 
 def as_server(
@@ -59,7 +95,8 @@ def as_server(
     """Send to one client, on loopback, what the server sent; return how many lines that were.
 
     Every message says ``replay``, and an answer waits for a request of the client, whose id it
-    takes. Lines for ABB go only to a client that said ``REPLAY``. ``listening`` is told the port.
+    takes. Targets go only to a client that accepts a recording: by ``accept_replay`` in its hello,
+    or in lines for ABB by ``REPLAY``. ``listening`` is told the port.
     """
     with socket.create_server(("127.0.0.1", port)) as server:
         server.settimeout(SILENCE_S)
@@ -93,18 +130,18 @@ class _Asked:
     def next_id(self) -> Any:
         """Wait for a request and return its id; None where the client leaves."""
         while (line := self.next_line()) is not None:
-            identity = _identity(line)
+            identity = (_object(line) or {}).get("id")
             if identity is not None:
                 return identity
         return None
 
 
-def _identity(line: bytes) -> Any:
+def _object(line: bytes) -> dict[str, Any] | None:
     try:
         body = orjson.loads(line)
     except ValueError:
         return None
-    return body.get("id") if isinstance(body, dict) else None
+    return body if isinstance(body, dict) else None
 
 
 def _answers(lines: Iterable[Line], asked: _Asked) -> Iterator[bytes]:
@@ -112,9 +149,8 @@ def _answers(lines: Iterable[Line], asked: _Asked) -> Iterator[bytes]:
     for line in lines:
         if line.kind != "tx":
             continue
-        try:
-            body = orjson.loads(line.text)
-        except ValueError:  # for ABB, where every line answers one
+        body = _object(line.text)
+        if body is None:  # for ABB, where every line answers one
             request = asked.next_line()
             if request is None:
                 return
@@ -124,6 +160,14 @@ def _answers(lines: Iterable[Line], asked: _Asked) -> Iterator[bytes]:
                 return
             yield re.sub(rb",LIVE$", b",REPLAY", line.text)
             continue
+        if not greeted and body.get("op") != "hello":
+            request = asked.next_line()
+            if request is None:
+                return
+            greeted = (_object(request) or {}).get("accept_replay") is True
+            if not greeted:
+                yield _REFUSAL
+                return
         if body.get("id") is not None:
             body["id"] = asked.next_id()
             if body["id"] is None:
