@@ -43,6 +43,11 @@ class RobotClient:
         self._quickest_ms = math.inf
         self.late_ms = 0.0
         self.hello = self.receive()
+        if self.hello["op"] == "hello" and not str(self.hello.get("version")).startswith("1."):
+            self.close()
+            raise PermissionError(
+                f"the server speaks version {self.hello.get('version')}, this client 1.0"
+            )
         self.send("hello", version="1.0", mode=mode, **hello)
         first = self.hello if self.hello["op"] == "error" else self.receive()
         if first["op"] == "error":
@@ -58,7 +63,13 @@ class RobotClient:
         line = self._lines.readline()
         if not line.endswith(b"\n"):
             raise ConnectionError("the server has gone")
-        message: Message = json.loads(line)
+        try:
+            message: Message = json.loads(line)
+            message["op"]
+        except (ValueError, TypeError, KeyError):
+            raise ConnectionError(
+                f"this is no robot socket of mushpipe: it says {line[:60]!r}"
+            ) from None
         if "t_ms" in message:
             delay_ms = time.monotonic() * 1000 - message["t_ms"]
             self._quickest_ms = min(self._quickest_ms, delay_ms)

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
+    import ssl
+
     from mushpipe.robot.client import RobotClient
 
 app = typer.Typer(help="Talk to the robot socket, as a robot would.", no_args_is_help=True)
@@ -35,9 +37,16 @@ class Outcome(StrEnum):
     failed = "failed"
 
 
+class _NobodyReads(Exception):  # noqa: N818 - no fault: `| head`
+    """Our own output was closed, which is no trouble of the connection."""
+
+
 def _out(text: str) -> None:
-    sys.stdout.write(text + "\n")
-    sys.stdout.flush()
+    try:
+        sys.stdout.write(text + "\n")
+        sys.stdout.flush()
+    except BrokenPipeError as error:
+        raise _NobodyReads from error
 
 
 def _note(text: str) -> None:
@@ -56,7 +65,9 @@ def client(
     address: AddressArgument = "127.0.0.1:5005",
     mode: Annotated[Mode, typer.Option(help="ask, or be sent every result")] = Mode.request,
     count: Annotated[int, typer.Option(help="messages to show; 0 is for ever", min=0)] = 0,
-    most: Annotated[int, typer.Option("--max", help="targets to ask for", min=1, max=1000)] = 10,
+    most: Annotated[
+        int | None, typer.Option("--max", help="targets to ask for, default 10", min=1, max=1000)
+    ] = None,
     max_age_ms: Annotated[int | None, typer.Option(help="refuse what is older", min=1)] = None,
     every: Annotated[float, typer.Option(help="seconds between requests", min=0, max=9)] = 1.0,
     ack: Annotated[
@@ -71,18 +82,21 @@ def client(
     raw: Annotated[bool, typer.Option("--raw", help="print the lines as they come")] = False,
 ) -> None:
     """Print targets and acknowledge them, reconnecting when the server goes away."""
-    import ssl
-
     host, port = _split(address)
+    if mode is Mode.stream and (most is not None or max_age_ms is not None):
+        raise typer.BadParameter("--max and --max-age-ms go with --mode request")
     hello: dict[str, Any] = {"accept_replay": accept_replay, "name": name}
     if token_file is not None:
         hello["token"] = token_file.read_text().strip()
     if tls_ca is not None:
-        hello["tls"] = ssl.create_default_context(cafile=tls_ca)
-    shown = 0
-    while not count or shown < count:
+        hello["tls"] = _trust(tls_ca)
+    shown = [0]  # over all connections
+    wishes = (10 if most is None else most, max_age_ms, every, ack or [])
+    while not count or shown[0] < count:
         try:
-            shown = _talk(host, port, mode, hello, (most, max_age_ms, every, ack or []), count, raw)
+            _talk(host, port, mode, hello, wishes, (shown, count), raw)
+        except _NobodyReads as error:
+            raise BrokenPipeError from error
         except PermissionError as error:
             _note(f"refused: {error}")
             raise typer.Exit(1) from None
@@ -97,18 +111,18 @@ def _talk(
     mode: Mode,
     hello: dict[str, Any],
     wishes: tuple[int, int | None, float, list[Outcome]],
-    count: int,
+    counts: tuple[list[int], int],
     raw: bool,
-) -> int:
-    """Hold one conversation; return how many messages were shown."""
+) -> None:
+    """Hold one conversation, and count the messages that are shown."""
     from mushpipe.robot.client import RobotClient
 
     most, max_age_ms, every, ack = wishes
     asked = {"max": most} | ({} if max_age_ms is None else {"max_age_ms": max_age_ms})
-    shown = 0
+    shown, count = counts
     with RobotClient(host, port, mode, **hello) as connection:
         _note(f"connected: {connection.hello['software']}")
-        while not count or shown < count:
+        while not count or shown[0] < count:
             if mode is Mode.stream:
                 message = connection.receive()
                 connection.send("heartbeat")
@@ -118,13 +132,22 @@ def _talk(
             if connection.late_ms > message.get("valid_ms", math.inf):
                 _note(f"{connection.late_ms:.0f} ms late on the way: no longer valid")
                 message["targets"] = []
-            shown += message["op"] != "heartbeat"
+            shown[0] += message["op"] != "heartbeat"
             if message["op"] == "bye":
                 raise ConnectionError(f"the server says bye: {message['reason']}")
             _acknowledge(connection, message, ack, raw)
-            if mode is Mode.request and (not count or shown < count):
+            if mode is Mode.request and (not count or shown[0] < count):
                 time.sleep(every)
-    return shown
+
+
+def _trust(path: Path) -> ssl.SSLContext:
+    import ssl
+
+    try:
+        return ssl.create_default_context(cafile=path)
+    except OSError as error:
+        why = error.strerror or "it holds no certificate in PEM"
+        raise typer.BadParameter(f"--tls-ca {path}: {why}") from error
 
 
 def _acknowledge(

@@ -38,7 +38,11 @@ def lines_of(path: Path, client: int | None = None) -> tuple[list[Line], list[st
         client = next((line.client for line in said if line.kind == "rx"), None)
     found = [line for line in said if line.client == client]
     if not found:
-        raise InputError(f"{path}: there is no such client in this transcript")
+        raise InputError(
+            f"{path}: no client said anything; choose one with --client"
+            if client is None
+            else f"{path}: there is no such client in this transcript"
+        )
     return found, damage
 
 

@@ -144,14 +144,22 @@ def read_transcript(path: Path) -> tuple[list[Line], list[str]]:
     found: list[tuple[int, Line]] = []
     reader = RecordingReader(path)
     for raw in reader.messages(set(kinds)):
-        body = orjson.loads(raw.message.data)
-        text = body["line"].encode()
-        if body["encoding"] == "base64":
-            text = base64.b64decode(text)
         kind = kinds[raw.channel.topic]
-        found.append((body["sequence"], Line(kind, body["client"], text, body["monotonic_ns"])))
+        try:
+            found.append(_line(kind, orjson.loads(raw.message.data)))
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            what = f"message {len(found)} on {raw.channel.topic} is no line of a robot: {error!r}"
+            raise InputError(f"{path}: {what}") from error
     if not found:
         why = f"; the file is damaged: {'; '.join(reader.damage)}" if reader.damage else ""
         raise InputError(f"{path}: there is no transcript of a robot in it{why}")
     # File order follows the wall clock, which may have jumped; the sequence is the truth.
     return [line for _, line in sorted(found, key=lambda entry: entry[0])], reader.damage
+
+
+def _line(kind: Kind, body: dict[str, Any]) -> tuple[int, Line]:
+    """Return an entry and its number."""
+    text = body["line"].encode()
+    if body["encoding"] == "base64":
+        text = base64.b64decode(text)
+    return body["sequence"], Line(kind, body["client"], text, body["monotonic_ns"])

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import socket
 import subprocess
 import sys
 import threading
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 import pytest
@@ -15,6 +17,7 @@ from mushpipe.cli import app
 from mushpipe.core.errors import InputError
 from mushpipe.robot import commands
 from mushpipe.robot.client import RobotClient
+from mushpipe.robot.replay import as_server, lines_of
 from tests.robot.scene import bench
 from tests.robot.test_transcript import record
 
@@ -86,6 +89,62 @@ def test_a_transcript_is_replayed(tmp_path: Path) -> None:
         assert '"effect":"removed"' in done.output
     assert robot("replay", path, "--connect", f"127.0.0.1:{b.port}").exit_code == 1
     assert robot("replay", path).exit_code == 2
+
+
+def test_a_recording_is_replayed_to_nobody_who_does_not_accept_it(tmp_path: Path) -> None:
+    path = tmp_path / "robot.mcap"
+    record(path)
+    port: SimpleQueue[int] = SimpleQueue()
+    lines, _ = lines_of(path)
+    thread = threading.Thread(
+        target=as_server, args=(lines, 0, lambda *_: None, port.put), daemon=True
+    )
+    thread.start()
+    with pytest.raises(PermissionError, match="replay_refused"):
+        RobotClient(port=port.get(timeout=20))
+    thread.join(20)
+
+
+def test_a_transcript_is_replayed_to_a_server_of_a_recording_that_wants_a_token(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "robot.mcap"
+    record(path)
+    (tmp_path / "token").write_text("t" * 16)
+    with bench(replay=True, token="t" * 16) as b:
+        b.publish()
+        to = ("--connect", f"127.0.0.1:{b.port}")
+        assert robot("replay", path, *to).exit_code == 1
+        done = robot("replay", path, *to, "--accept-replay", "--token-file", tmp_path / "token")
+    assert done.exit_code == 0, done.output
+    assert '"effect":"removed"' in done.output
+    assert "tttt" not in done.output
+
+
+def test_another_program_on_the_port_is_named() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+
+        def speak() -> None:
+            connection, _ = other.accept()
+            with connection:
+                connection.sendall(b"SSH-2.0-OpenSSH\r\n")
+
+        threading.Thread(target=speak, daemon=True).start()
+        with pytest.raises(ConnectionError, match="no robot socket of mushpipe"):
+            RobotClient(port=other.getsockname()[1])
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("client", "127.0.0.1:70741"),
+        ("client", "--mode", "stream", "--max", 1),
+        ("client", "--tls-ca", "nofile.pem"),
+        ("replay", "robot.mcap", "--listen", 99999),
+    ],
+)
+def test_arguments_that_make_no_sense_are_refused(arguments: tuple[object, ...]) -> None:
+    assert robot(*arguments).exit_code == 2
 
 
 def test_a_damaged_transcript_is_replayed_as_far_as_it_goes(tmp_path: Path) -> None:

@@ -154,7 +154,7 @@ def test_the_reference_client() -> None:
 def test_the_reference_client_sees_what_a_slow_network_held_back() -> None:
     """Two lines that the server wrote 600 ms apart arrive together."""
     lines: list[dict[str, Any]] = [
-        {"op": "hello", "t_ms": 1000},
+        {"op": "hello", "version": "1.0", "t_ms": 1000},
         {"op": "heartbeat", "t_ms": 1000},
         {"op": "targets", "t_ms": 1000},
         {"op": "targets", "t_ms": 400},

@@ -11,11 +11,14 @@ from queue import SimpleQueue
 import pytest
 
 from mushpipe.core.errors import InputError
+from mushpipe.core.recorder import RecordingWriter
+from mushpipe.core.types import Header
+from mushpipe.core.wire import json_message
 from mushpipe.robot import transcript as module
 from mushpipe.robot.client import RobotClient
 from mushpipe.robot.clock import Clock
 from mushpipe.robot.replay import as_client, as_server, lines_of
-from mushpipe.robot.transcript import Line, Transcript, read_transcript
+from mushpipe.robot.transcript import SCHEMA, Line, Transcript, read_transcript
 from tests.robot.peer import CLIENT, SERVER, Peer
 from tests.robot.scene import PATIENCE_S, FakeClock, bench
 
@@ -176,5 +179,11 @@ def test_a_recording_without_a_transcript(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no transcript"):
         lines_of(path)
     record(tmp_path / "robot.mcap")
+    writer = RecordingWriter(tmp_path / "edited.mcap", {})
+    header = Header(1, 0, "")
+    writer.write("/robot/rx", json_message(SCHEMA, header, {"client": 1, "line": "x"}), header)
+    writer.close()
+    with pytest.raises(InputError, match="message 0 on /robot/rx is no line of a robot"):
+        lines_of(tmp_path / "edited.mcap")
     with pytest.raises(InputError, match="no such client"):
         lines_of(tmp_path / "robot.mcap", 77)
