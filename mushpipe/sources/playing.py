@@ -8,8 +8,10 @@ from collections.abc import Callable, Iterable, Iterator, Set
 from dataclasses import replace
 from typing import Any, TypeVar
 
+import numpy as np
 from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoders
 from mcap_ros2.decoder import DecoderFactory as Ros2Decoders
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from mushpipe.core import wire
@@ -20,10 +22,11 @@ from mushpipe.core.stage import Source
 from mushpipe.core.types import Header, RgbdFrame
 from mushpipe.sources.images import decode_camera, decode_color, decode_depth
 from mushpipe.sources.pairing import Pairing
-from mushpipe.sources.topics import Topics
+from mushpipe.sources.topics import Topics, is_beside, says_aligned
 
 T = TypeVar("T")
 logger = logging.getLogger("mushpipe")
+FARTHEST_M = 30.0
 NO_DEPTH = "%s has no depth: positions, distances and diameters will be missing"
 
 
@@ -94,6 +97,8 @@ class Player:
         self.frames = 0
         self.size: tuple[int, ...] | None = None
         self._factories = (ProtobufDecoders(), Ros2Decoders())
+        self._calibrated = ""  # frame of the calibration
+        self._judged = False  # whether there was depth to be judged
         self._found_beside: dict[int, dict[str, wire.Message]] = {}
 
     def wanted(self) -> set[str]:
@@ -157,7 +162,12 @@ class Player:
         """Decode a calibration; one that cannot be is counted, where ``what`` says as what."""
         name = self.topics.color.split("/")
         rectified = any(part.startswith("image_rect") for part in name)  # as ROS calls them
-        return self._decode(raw, lambda message, _: decode_camera(message, rectified), what)
+
+        def decode(message: Any, raw: Raw) -> Camera | None:
+            self._calibrated = _stamp(message, raw)[1]
+            return decode_camera(message, rectified)
+
+        return self._decode(raw, decode, what)
 
     def _decode(
         self, raw: Raw, decode: Callable[[Any, Raw], T | None], what: str = "images"
@@ -183,7 +193,7 @@ class Player:
 
     def _depth(self, message: Any, raw: Raw) -> tuple[int, _Depth]:
         stated = raw.channel.metadata.get("depth_scale")
-        scale = self.settings.depth_scale or (float(stated) if stated else None)
+        scale = float(stated) if stated else self.settings.depth_scale
         stamp_ns, frame_id = _stamp(message, raw)
         return stamp_ns, (frame_id, *decode_depth(message, scale))
 
@@ -195,18 +205,48 @@ class Player:
         sequence = header.sequence if self.numbered else self.frames
         header = replace(header, sequence=sequence)
         self.frames += 1
-        if depth and depth[0] != header.frame_id and "aligned" not in (self.topics.depth or ""):
+        aligned = says_aligned(self.topics.depth or "", self.topics.color)
+        if depth and depth[0] != header.frame_id and not aligned:
             raise InputError(
                 f"{self.name}: depth ({self.topics.depth}) is in frame '{depth[0]}', "
                 f"colour in '{header.frame_id}': depth must be aligned to colour; record "
                 "aligned_depth_to_color, or play without depth: --set source.use_depth=false"
             )
+        self._check_calibration(header.frame_id)
         self._watch_size(image.shape[:2], sequence)
         try:
             native, scale = depth[1:] if depth else (None, 0.001)
-            return RgbdFrame(header, image, native, scale, self._camera(image.shape[:2], camera))
+            frame = RgbdFrame(header, image, native, scale, self._camera(image.shape[:2], camera))
         except ValueError as error:
             raise InputError(f"{self.name}, frame {sequence}: {error}") from error
+        if frame.depth is not None and not self._judged:
+            self._judge_depth(sequence, frame.depth[::8, ::8] * frame.depth_scale)
+        return frame
+
+    def _check_calibration(self, frame_id: str) -> None:
+        """Refuse the calibration of another camera, unless it was named or stands beside colour."""
+        topic = self.topics.camera
+        if topic is None or self.settings.camera_topic or is_beside(topic, self.topics.color):
+            return
+        if self._calibrated and frame_id and self._calibrated != frame_id:
+            raise InputError(
+                f"{self.name}: the only calibration ({topic}) is of frame '{self._calibrated}', "
+                f"colour is in '{frame_id}': name it if it holds for colour (--set "
+                f"source.camera_topic={topic}), or set source.camera: {{fx: , fy: , cx: , cy: }}"
+            )
+
+    def _judge_depth(self, sequence: int, depth: NDArray[Any]) -> None:
+        """Warn, once, of depth (m) that no camera above a bed can have measured."""
+        known = depth[np.isfinite(depth) & (depth > 0)]
+        self._judged = len(known) > 0
+        if self._judged and (far := float(np.median(known))) > FARTHEST_M:
+            logger.warning(
+                "%s, frame %d: half of the depth is beyond %.0f m; where it is in millimetres, "
+                "set source.depth_scale: 0.001",
+                self.name,
+                sequence,
+                far,
+            )
 
     def _camera(self, size: tuple[int, ...], recorded: Camera | None) -> Camera | None:
         given = self.settings.camera

@@ -17,6 +17,7 @@ IMAGES = {
 }
 CALIBRATIONS = {"sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration"}
 _NOT_CAMERA = (RESULT_PREFIX, "/truth/")
+ALIGNED = "aligned_depth_to_color"
 _TRANSPORTS = ("/compressedDepth", "/compressed")
 
 
@@ -76,7 +77,7 @@ def _colors(images: list[str]) -> list[str]:
 
 def _depths(images: list[str]) -> list[str]:
     depths = [t for t in images if "depth" in t.lower()]
-    aligned = [t for t in depths if "aligned" in t.lower()]
+    aligned = [t for t in depths if ALIGNED in t.lower()]
     return _without_transports(aligned or depths)
 
 
@@ -93,9 +94,20 @@ def _base(topic: str) -> str:
 
 def _calibration(index: Index, path: Path, color: str) -> str | None:
     calibrations = _topics(index, CALIBRATIONS)
-    folder = _base(color).rpartition("/")[0]
-    beside = [t for t in calibrations if t.rpartition("/")[0] == folder]
-    return _one(path, "camera", beside or [t for t in calibrations if "depth" not in t.lower()])
+    beside = [t for t in calibrations if is_beside(t, color)]
+    others = [t for t in calibrations if "depth" not in t.lower() and "infra" not in t.lower()]
+    return _one(path, "camera", beside or others)
+
+
+def is_beside(calibration: str, color: str) -> bool:
+    """Return whether a calibration stands in the same folder as the colour images."""
+    return calibration.rpartition("/")[0] == _base(color).rpartition("/")[0]
+
+
+def says_aligned(depth: str, color: str) -> bool:
+    """Return whether names say that depth is aligned to these colour images, of one camera."""
+    camera, found, _ = depth.lower().partition(ALIGNED)
+    return bool(found) and color.lower().startswith(camera)
 
 
 def _one(path: Path, role: str, candidates: list[str]) -> str | None:

@@ -95,11 +95,12 @@ def camera_info(
     d: tuple[float, ...] = (0, 0, 0, 0, 0),
     model: str = "plumb_bob",
     p: tuple[float, ...] = (0,) * 12,
+    frame_id: str = OPTICAL,
 ) -> Any:
     region = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0)
     return ros(
         "sensor_msgs/msg/CameraInfo",
-        header=header(stamp_ns, OPTICAL),
+        header=header(stamp_ns, frame_id),
         height=size[1],
         width=size[0],
         distortion_model=model,

@@ -14,8 +14,10 @@ from tests.io.bags import (
     CAMERA,
     COLOR,
     COLOR_INFO,
+    HEIGHT,
     RECT,
     T0,
+    WIDTH,
     Entry,
     camera_info,
     color_at,
@@ -32,6 +34,7 @@ from tests.io.bags import (
 )
 
 OTHER_INFO = camera_info(k=(99, 0, 1, 0, 99, 1, 0, 0, 1))
+MM_OFF = depth_pixels(7)
 LEFT = "/left/color/image_raw"
 RIGHT = "/right/color/image_raw"
 LEFT_DEPTH = "/left/aligned_depth_to_color/image_raw"
@@ -176,6 +179,56 @@ def test_unaligned_depth_is_refused_with_a_way_out(tmp_path: Path) -> None:
         "'camera_color_optical_frame': depth must be aligned to colour; record "
         "aligned_depth_to_color, or play without depth: --set source.use_depth=false"
     )
+
+
+@pytest.mark.parametrize(
+    "topic",
+    [
+        CAMERA + "aligned_depth_to_infra1/image_raw",
+        CAMERA + "depth_unaligned/image_raw",
+        RIGHT_DEPTH,
+    ],
+)
+def test_depth_aligned_to_something_else_is_no_depth_of_these_images(
+    topic: str, tmp_path: Path
+) -> None:
+    other = raw_image(depth_pixels(0), "16UC1", frame_id="another_optical_frame")
+    text = refusal(tmp_path, [color_at(0), (topic, T0 + 1, other)])
+    assert text.startswith(f"depth ({topic}) is in frame 'another_optical_frame', colour in")
+
+
+def test_depth_aligned_to_colour_comes_before_depth_aligned_to_infrared(tmp_path: Path) -> None:
+    infra = (CAMERA + "aligned_depth_to_infra1/image_raw", T0 + 1, raw_image(MM_OFF, "16UC1"))
+    frame = first(tmp_path, [infra, *rgbd([0])])
+    np.testing.assert_array_equal(frame.depth, depth_pixels(0))
+
+
+@pytest.mark.parametrize("topic", ["/cam2/camera_info", "/cam2/color/camera_info"])
+def test_the_calibration_of_another_camera_is_refused_unless_it_is_named(
+    topic: str, tmp_path: Path
+) -> None:
+    entries = [(topic, T0, camera_info(frame_id="cam2")), color_at(0)]
+    text = refusal(tmp_path / "a", entries)
+    assert text.startswith(f"the only calibration ({topic}) is of frame 'cam2', colour is in")
+    assert first(tmp_path / "b", entries, camera_topic=topic).camera is not None
+
+
+def test_the_calibration_of_an_infrared_camera_is_not_that_of_colour(tmp_path: Path) -> None:
+    entries = [(CAMERA + "infra1/camera_info", T0, OTHER_INFO), color_at(0)]
+    assert first(tmp_path, entries).camera is None
+
+
+def test_depth_beyond_any_bed_is_warned_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    far = raw_image(np.full((HEIGHT, WIDTH), 513, np.float32), "32FC1")
+    entries = [(COLOR_INFO, T0, camera_info()), color_at(0), (ALIGNED, T0 + 1, far)]
+    first(tmp_path / "a", entries)
+    assert "half of the depth is beyond 513 m; where it is in millimetres" in caplog.text
+    caplog.clear()
+    frame = first(tmp_path / "b", entries, depth_scale=0.001)
+    assert frame.depth_m == pytest.approx(0.513)
+    assert not caplog.messages
 
 
 def test_unaligned_depth_may_be_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
