@@ -70,7 +70,7 @@ def read_traces(path: Path) -> Iterator[Trace]:
     from mushpipe.sources.mcap import McapSource
 
     manifest = read_manifest(path)
-    images = path
+    images: dict[str, Any] = {"path": path}
     if COLOR_TOPIC not in RecordingReader(path).index().channels and has_results(path):
         found = source_recording(path, manifest)
         if found is None:
@@ -78,16 +78,18 @@ def read_traces(path: Path) -> Iterator[Trace]:
             raise UsageError(
                 f"{path} holds no images, and {stated} is neither at its old place nor beside it"
             )
-        images = found
+        # as they were played, but once and at once: what was cut, chosen and calibrated alike
+        given = dict(manifest["graph"]["source"])
+        images = {k: given[k] for k in given if k not in ("use", "speed", "loop")} | {"path": found}
     order = list(manifest.get("graph", {}).get("stages", {}))
     reader = RecordingReader(path)
     groups = _groups(reader)
-    stamp, messages = next(groups, (None, []))
-    for frame in McapSource(path=images).frames():
+    key, messages = next(groups, (None, []))
+    for frame in McapSource.model_validate(images).frames():
         trace = Trace(frame, {}, {})
-        if frame.header.stamp_ns == stamp:
+        if (frame.header.stamp_ns, frame.header.sequence) == key:
             trace = _trace(frame, messages, order)
-            stamp, messages = next(groups, (None, []))
+            key, messages = next(groups, (None, []))
         yield trace
     if reader.damage:
         raise InputError(f"{path} is damaged: {'; '.join(reader.damage)}")
@@ -108,11 +110,16 @@ def read_trace(path: Path, sequence: int) -> Trace:
     raise UsageError(f"{path}: there is no frame {sequence}; it holds {seen[0]} to {seen[-1]}")
 
 
-def _groups(reader: RecordingReader) -> Iterator[tuple[int, list[Raw]]]:
+def _groups(reader: RecordingReader) -> Iterator[tuple[tuple[int, int], list[Raw]]]:
+    """Yield the stamp and number of each frame with its results; stamps may stand still."""
+
+    def frame(raw: Raw) -> tuple[int, int]:
+        return raw.message.publish_time, raw.message.sequence
+
     topics = {t for t in reader.index().channels if t.startswith(RESULT_PREFIX)}
     if topics:
-        for stamp, group in groupby(reader.messages(topics), lambda raw: raw.message.publish_time):
-            yield stamp, list(group)
+        for key, group in groupby(reader.messages(topics), frame):
+            yield key, list(group)
 
 
 def _trace(frame: RgbdFrame, messages: list[Raw], order: list[str]) -> Trace:

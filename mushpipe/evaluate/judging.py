@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from mushpipe.core.errors import InputError
+from mushpipe.core.errors import InputError, UsageError
 from mushpipe.evaluate.events import UP, Events, Verdict, comparable, events_of, judge
 from mushpipe.evaluate.metrics import Value, measure
 from mushpipe.evaluate.results import Results, none_found
 from mushpipe.evaluate.truth import Place, TruthSet, has_truth, read_truth
 from mushpipe.traces import source_recording
+
+OPTICAL = "the camera's optical frame"  # of labels that name none
 
 
 @dataclass(frozen=True)
@@ -120,10 +122,18 @@ def judge_results(
         recording: What the results were made from, where it is at hand.
     """
     judged = Judged((recording or results.path).stem, results, truth, recording)
+    start = results.manifest.get("graph", {}).get("source", {}).get("start")
+    if start and truth.numbered and results.frames and results.frames[0][0].sequence == 0:
+        raise UsageError(
+            f"{truth.name} labels frames by their number, and the frames of {results.path} are "
+            f"counted from {start} s on: label them by 'stamp_ns', or run the whole recording"
+        )
     for header, detections in results.frames:
         place = truth.place(header)
         if place is not None:
             known = truth.frames[place]
+            if known.frame_id is None and detections.frame_id in results.robot_frames:
+                known = replace(known, frame_id=OPTICAL)
             judged.verdicts.append(judge(judged.name, place, known, header, detections, rules.iou))
     if len(judged.verdicts) < len(results.frames):
         unknown = len(results.frames) - len(judged.verdicts)

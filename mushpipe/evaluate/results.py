@@ -97,6 +97,13 @@ class Results:
         source = self.manifest.get("graph", {}).get("source", {})
         return any(source.get(key) for key in ("max_frames", "start", "end"))
 
+    @property
+    def robot_frames(self) -> set[str]:
+        """Frames that a stage took its results to from the camera's."""
+        stages = self.manifest.get("graph", {}).get("stages", {}).values()
+        transforms = (stage.get("T_base_camera") for stage in stages)
+        return {transform["frame"] for transform in transforms if transform}
+
 
 def read_results(path: Path, topic: str | None = None) -> Results:
     """Read a result recording.

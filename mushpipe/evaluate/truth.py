@@ -53,6 +53,11 @@ class TruthSet:
     frames: Mapping[Place, FrameTruth]
     damage: tuple[str, ...] = ()
 
+    @property
+    def numbered(self) -> bool:
+        """Whether frames are found by their number."""
+        return any(kind == "index" for kind, _ in self.frames)
+
     def place(self, header: Header) -> Place | None:
         """Return where the truth of a frame stands; None where it is not known."""
         places: tuple[Place, Place] = ("stamp_ns", header.stamp_ns), ("index", header.sequence)

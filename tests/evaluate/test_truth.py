@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import math
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,13 @@ import numpy as np
 import pytest
 
 from mushpipe import Header
-from mushpipe.core.errors import InputError
+from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.truth import Ignore
+from mushpipe.evaluate.judging import Rules, judge_results
 from mushpipe.evaluate.labels import convert
-from mushpipe.evaluate.truth import has_truth, read_truth
-from tests.evaluate.scenes import FRAME, bed, header, write_recording, write_results
+from mushpipe.evaluate.results import Results, of_picks
+from mushpipe.evaluate.truth import FrameTruth, TruthSet, has_truth, read_truth
+from tests.evaluate.scenes import FRAME, bed, header, picks_of, write_recording, write_results
 
 FULL = {
     "mushpipe_labels": 1,
@@ -165,6 +168,28 @@ def test_truth_of_a_recording(tmp_path: Path) -> None:
     frame = truth.frames["stamp_ns", header(1).stamp_ns]
     assert frame.frame_id == FRAME
     assert (frame.caps.apex == bed(1).apex).all()
+
+
+def test_labels_that_name_no_frame_are_in_that_of_the_camera(tmp_path: Path) -> None:
+    there, robot = bed(0), "robot_base"
+    picks = replace(picks_of(there), frame_id=robot)
+    transform = {"frame": robot, "translation": [0, 0, 1], "quaternion": [1, 0, 0, 0]}
+    manifest = {"graph": {"stages": {"pick": {"use": "picks", "T_base_camera": transform}}}}
+    frames = [(header(0), of_picks(picks))]
+    results = Results(tmp_path / "r.mcap", "/mushpipe/pick", frames, manifest=manifest)
+    for place in (("index", 0), ("stamp_ns", header(0).stamp_ns)):
+        truth = TruthSet("labels.json", {place: FrameTruth(there)})
+        judged = judge_results(results, truth, Rules())
+        assert judged.notes == ["truth and results are in different frames: 3D errors are unknown"]
+
+
+def test_numbers_of_frames_do_not_fit_a_run_that_began_later(tmp_path: Path) -> None:
+    there = bed(0)
+    manifest = {"graph": {"source": {"use": "mcap", "start": 0.2}, "stages": {}}}
+    frames = [(header(0), of_picks(picks_of(there)))]
+    results = Results(tmp_path / "r.mcap", "/mushpipe/pick", frames, manifest=manifest)
+    with pytest.raises(UsageError, match=r"counted from 0\.2 s on: label them by 'stamp_ns'"):
+        judge_results(results, TruthSet("labels.json", {("index", 0): FrameTruth(there)}), Rules())
 
 
 def test_a_recording_without_truth_says_so(tmp_path: Path) -> None:

@@ -91,6 +91,41 @@ def test_a_frame_that_no_stage_answered_stands_alone(tmp_path: Path) -> None:
         read_trace(path, 3)
 
 
+def test_frames_whose_stamp_stands_still_stay_apart(tmp_path: Path) -> None:
+    traces = [full_trace(i) for i in range(3)]
+    stamp = traces[0].frame.header.stamp_ns
+    still = []
+    for trace in traces:
+        header = replace(trace.frame.header, stamp_ns=stamp)
+        frame = replace(trace.frame, header=header, attached={})
+        still.append(replace(trace, frame=frame))
+    found = list(read_traces(record(tmp_path / "out.mcap", still, frames="source")))
+    assert [len(trace.outputs["detect"]) for trace in found] == [2, 2, 2]
+    for trace, wanted in zip(found, still, strict=True):
+        same(trace.outputs["open"][0], wanted.outputs["open"][0])
+
+
+def test_images_are_played_as_the_run_played_them(tmp_path: Path) -> None:
+    traces = [full_trace(i) for i in range(3)]
+    source = record(tmp_path / "bed.mcap", [Trace(t.frame, {}, {}) for t in traces])
+    seconds = (traces[1].frame.header.stamp_ns - traces[0].frame.header.stamp_ns) / 1e9
+    played = {"use": "mcap", "path": "bed.mcap", "start": seconds / 2, "speed": 1, "loop": 3}
+    given = {"camera": {"fx": 5.0, "fy": 6.0, "cx": 7.0, "cy": 8.0}}
+    manifest = {
+        "graph": {"source": {**played, **given}, "stages": {}},
+        "recordings": [_describe(source)],
+    }
+    sink = McapSink(path=tmp_path / "out.mcap", frames=False)
+    sink.open(RunInfo("bed", manifest))
+    for trace in traces[1:]:
+        sink.consume(trace)
+    sink.close()
+    found = list(read_traces(tmp_path / "out.mcap"))
+    assert [trace.frame.header for trace in found] == [t.frame.header for t in traces[1:]]
+    assert [trace.frame.camera.fx for trace in found if trace.frame.camera] == [5, 5]
+    assert all(trace.outputs for trace in found)
+
+
 def test_images_come_from_the_recording_named_in_the_manifest(tmp_path: Path) -> None:
     traces = [full_trace(i) for i in range(2)]
     source = record(tmp_path / "bed.mcap", [Trace(t.frame, {}, {}) for t in traces])
