@@ -42,7 +42,9 @@ def read_picks(path: Path, topic: str | None = None) -> Iterator[tuple[Header, P
     index = reader.index()
     topics = sorted(t for t in index.channels if index.schema_name(t) == _SCHEMA)
     if topic is None and len(topics) > 1:
-        raise UsageError(f"{path}: several topics hold picks: choose with --topic {topics[0]}")
+        raise UsageError(
+            f"{path}: several topics hold picks: choose with --topic {' or --topic '.join(topics)}"
+        )
     if topic not in (None, *topics) or not topics:
         found = ", ".join(topics or sorted(index.channels)) or "nothing"
         raise InputError(f"{path}: no picks on {topic or 'any topic'} (it holds {found})")

@@ -16,6 +16,7 @@ from mushpipe.core.overrides import apply_override
 from mushpipe.core.plan import Node, Plan
 from mushpipe.core.plugins import Registry
 from mushpipe.core.stage import Kind, Plugin, ports_of
+from mushpipe.core.wire import RESULT_PREFIX, TIMING_TOPIC
 from mushpipe.core.wiring import wire
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
@@ -140,6 +141,8 @@ def _check_names(
             message = f"'{name}' is no name: letters, digits, - and _, beginning with a letter"
         elif name in GraphFile.model_fields:
             message = f"'{name}' is a key of the graph file and cannot name a stage or sink"
+        elif at[0] == "stages" and RESULT_PREFIX + name == TIMING_TOPIC:
+            message = f"'{name}' cannot name a stage: its results would stand where times do"
         elif at[0] == "sinks" and name in stages:
             message = f"a stage is called '{name}' already"
         if message:

@@ -11,8 +11,6 @@ from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.tables import Floats
 from mushpipe.evaluate.plane import PlaneRow
 
-FARTHEST_OFF = 0.2  # share of the distance; the SR300 is off by 1 %
-
 
 @dataclass(frozen=True, eq=False)
 class Correction:
@@ -55,7 +53,7 @@ def fit_correction(rows: Sequence[PlaneRow], order: int) -> Correction:
         order: Of the polynomial, 0 to 2; it needs more distances than that.
 
     Raises:
-        UsageError: There are too few distances, or one is not that of the plane.
+        UsageError: There are too few distances.
         InputError: A plane has no depth.
     """
     distances = {row.distance_m for row in rows}
@@ -64,12 +62,6 @@ def fit_correction(rows: Sequence[PlaneRow], order: int) -> Correction:
     for row in rows:
         if not np.isfinite(_offset(row)):
             raise InputError(f"{row.name}: there is no depth in the middle of its images")
-        mean = row.values["mean_mm"].value / 1e3
-        if abs(mean - row.distance_m) > FARTHEST_OFF * row.distance_m:
-            raise UsageError(
-                f"{row.name}: its depth says {mean:.3f} m, --plane {row.distance_m:g} m: no camera "
-                "is so far off; state the distance along the optical axis, in metres"
-            )
     z = np.array([row.values["mean_mm"].value / 1e3 for row in rows])
     error = np.array([_offset(row) for row in rows])
     powers = np.vander(z, order + 1, increasing=True)

@@ -15,6 +15,7 @@ from mushpipe.evaluate.metrics import Value
 from mushpipe.evaluate.thresholds import Outcome, check, parse_threshold, require_known
 
 WINDOW = 31
+FARTHEST_OFF = 0.2  # share of the distance; the SR300 is off by 1 %
 PLANE_METRICS = ("mean_mm", "std_mm", "range_mm", "offset_mm", "flat_std_mm", "valid")
 
 
@@ -78,6 +79,7 @@ def measure_plane(
 
     Raises:
         InputError: The recording cannot be played, or holds no depth.
+        UsageError: The plane is not at that distance.
     """
     from mushpipe.sources.mcap import McapSource
 
@@ -97,6 +99,12 @@ def measure_plane(
         if len(frames) > 1 and resamples:
             ends = statistics.interval(statistics.evaluate(statistics.mean, x, weights))
         values[name] = Value(float(value), *ends, len(x))
+    mean = values["mean_mm"].value / 1e3
+    if abs(mean - distance_m) > FARTHEST_OFF * distance_m:
+        raise UsageError(
+            f"{recording.stem}: its depth says {mean:.3f} m, --plane {distance_m:g} m: no camera "
+            "is so far off; state the distance along the optical axis, in metres"
+        )
     return PlaneRow(recording.stem, distance_m, len(frames), values)
 
 

@@ -106,7 +106,7 @@ def _keyed(reader: RecordingReader, topics: str) -> Iterator[tuple[Key, Raw]]:
 
 
 def _of_messages(key: Key, a: Raw, b: Raw, tolerance: float) -> Iterator[Difference]:
-    if a.message.data == b.message.data:
+    if a.message.data == b.message.data and a.channel.metadata == b.channel.metadata:
         return
     ours, theirs = _fields(a), _fields(b)
     for name in ours | theirs:
@@ -120,6 +120,12 @@ def _of_messages(key: Key, a: Raw, b: Raw, tolerance: float) -> Iterator[Differe
 
 def _fields(raw: Raw) -> dict[str, Any]:
     """Return every value of a message: an array for an image, else a list for each path."""
+    # such as the unit of a depth image
+    beside = {f"metadata.{name}": [text] for name, text in raw.channel.metadata.items()}
+    return beside | _content(raw)
+
+
+def _content(raw: Raw) -> dict[str, Any]:
     data = raw.message.data
     if raw.channel.message_encoding == "json":
         return _by_path(orjson.loads(data))
@@ -128,7 +134,8 @@ def _fields(raw: Raw) -> dict[str, Any]:
         return {"bytes": [data]}
     if raw.schema is not None and raw.schema.name == _IMAGE and message.encoding in _PIXELS:
         pixels = np.frombuffer(message.data, _PIXELS[message.encoding])
-        return {"size": [message.width, message.height, message.encoding], "pixels": pixels}
+        size = [message.width, message.height, message.encoding]
+        return {"size": size, "frame_id": [message.frame_id], "pixels": pixels}
     from google.protobuf.json_format import MessageToDict
 
     # A field that is zero stands in no protobuf message.
@@ -171,7 +178,8 @@ def _difference(a: Any, b: Any, tolerance: float) -> str | None:
     if isinstance(a, np.ndarray):
         if len(a) != len(b):
             return f"{len(a)} pixels against {len(b)}"
-        different = int(np.count_nonzero(a != b))
+        # unknown is the same only as unknown
+        different = int(np.count_nonzero((a != b) & ~((a != a) & (b != b))))
         return f"{different} of {len(a)} pixels" if different > tolerance * len(a) else None
     if len(a) != len(b):
         return f"{len(a)} values against {len(b)}"

@@ -19,6 +19,7 @@ from pydantic import Field, PrivateAttr, model_validator
 from mushpipe import Header, RunInfo, Sink, SinkPath, Trace
 from mushpipe.core.errors import DependencyError, UsageError
 from mushpipe.core.transform import Transform
+from mushpipe.sinks.rerun_memory import Remembering
 
 logger = logging.getLogger("mushpipe")
 PORT = 9876  # the SDK's own default
@@ -67,6 +68,7 @@ class RerunSink(Sink):
     _period_ns: int = PrivateAttr(0)
     _next_ns: int = PrivateAttr(0)
     _shown: tuple[list[str], float | None] | None = PrivateAttr(None)
+    _memories: tuple[Remembering, Remembering] | None = PrivateAttr(None)  # images, results
     _last: Header | None = PrivateAttr(None)
     _base: Transform | None = PrivateAttr(None)
 
@@ -97,6 +99,7 @@ class RerunSink(Sink):
         sinks += [rr.GrpcSink(url) for url in self._viewers()]
         self._recording = rr.RecordingStream("mushpipe", recording_id=run.recording)
         self._recording.set_sinks(*sinks)
+        self._memories = (Remembering(self._recording), Remembering(self._recording))
         graph = run.manifest.get("graph", {})
         self._base = _base(graph)
         log_start(self._recording, _workspace(graph), self._base)
@@ -133,14 +136,18 @@ class RerunSink(Sink):
 
         from mushpipe.sinks import rerun_log
 
-        rec, header = self._recording, trace.frame.header
+        if self._recording is None or self._memories is None:
+            raise RuntimeError("the sink is not open")
+        rec, header, (images, results) = self._recording, trace.frame.header, self._memories
         rerun_log.set_frame(rec, header)
         self._last = header
         self._lay_out(trace)
         if header.stamp_ns >= self._next_ns or not self._period_ns:
             self._next_ns = header.stamp_ns + self._period_ns
-            rerun_log.log_images(rec, trace, self.jpeg_quality, self.cloud_step)
-        rerun_log.log_results(rec, trace, self._base)
+            rerun_log.log_images(images, trace, self.jpeg_quality, self.cloud_step)
+            images.settle()
+        rerun_log.log_results(results, trace, self._base)
+        results.settle()
         self._write_notes(rr)
 
     def _lay_out(self, trace: Trace) -> None:

@@ -14,6 +14,7 @@ CLOUD, BASE = "camera/cloud", "camera/base"
 # in space, below the camera or below the robot's base, by the frame of the picks
 SPACE = CAPS, AXES, TARGETS, ORDER, WORKSPACE = "caps", "axes", "picks", "order", "workspace"
 COUNTS, TIMES, VALIDITY, LOG = "plots/count", "plots/time", "plots/depth", "log"
+MOMENTS = ("plots/", LOG)  # what stands at a frame alone
 HIDDEN_AT_FIRST = (FRAMES, INITIAL, CIRCLES)
 
 

@@ -198,6 +198,21 @@ def test_nothing_found_clears_what_was_shown(tmp_path: Path) -> None:
     assert [len(row) for row in values(found, "/camera/picks", "positions")] == [1, 0]
 
 
+def test_a_frame_without_depth_or_answer_does_not_show_those_of_the_one_before(
+    tmp_path: Path,
+) -> None:
+    mask = Mask(np.ones((24, 32), bool))
+    full = trace_of(make_frame(0), segment=mask, detect=make_circles(), pick=make_picks())
+    bare = trace_of(make_frame(1, depth=None))
+    found = show(tmp_path, [full, bare])
+    shown = ("depth", "holes", "masks/segment", "circles/detect", "picks", "ids")
+    in_space = ("cloud", "picks", "order", "caps", "axes")
+    for entity in (*(f"{IMAGE}/{e}" for e in shown), *(f"/camera/{e}" for e in in_space)):
+        cleared = [value for value in values(found, entity, "is_recursive") if value]
+        assert (cleared, sorted(found[entity]["frame"])) == ([[False]], [10, 11]), entity
+    assert not any("Clear" in name for name in found[f"{IMAGE}/color"])
+
+
 def test_counts_and_times_are_plotted(tmp_path: Path) -> None:
     traces = [trace_of(make_frame(i), detect=make_circles(), pick=make_picks()) for i in range(2)]
     found = show(tmp_path, traces)

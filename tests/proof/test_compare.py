@@ -86,6 +86,33 @@ def test_unknown_is_the_same_as_unknown_and_nothing_else(base: Path, tmp_path: P
     assert "0.04 against None" in found[0].text
 
 
+def test_depth_that_is_unknown_in_both_is_the_same(tmp_path: Path) -> None:
+    depth = np.full((24, 32), 0.5, np.float32)
+    depth[:10] = np.nan
+    other = depth.copy()
+    other[20, 3] = 0.6
+    paths = [
+        record(tmp_path / f"{i}.mcap", [trace_of(make_frame(depth=d, depth_scale=1.0))])
+        for i, d in enumerate((depth, depth, other))
+    ]
+    assert compare(paths[0], paths[1]).differences == []
+    (found,) = compare(paths[0], paths[2]).differences
+    assert (found.field, found.text) == ("pixels", "1 of 768 pixels")
+
+
+def test_the_same_numbers_in_another_unit_or_frame_differ(tmp_path: Path) -> None:
+    plain = make_frame()
+    finer = replace(plain, depth_scale=plain.depth_scale / 2, attached={})
+    moved = replace(plain, header=replace(plain.header, frame_id="elsewhere"), attached={})
+    paths = [
+        record(tmp_path / f"{i}.mcap", [trace_of(frame)])
+        for i, frame in enumerate((plain, finer, moved))
+    ]
+    assert [d.field for d in compare(paths[0], paths[1]).differences] == ["metadata.depth_scale"]
+    fields = {d.field for d in compare(paths[0], paths[2]).differences}
+    assert fields == {"frame_id", "frameId"}  # of images, and of the calibration
+
+
 def test_another_number_of_mushrooms_is_told_of(base: Path, tmp_path: Path) -> None:
     first = {n: v[:1] if isinstance(v, np.ndarray) else v for n, v in vars(make_picks()).items()}
     found = compare(base, record(tmp_path / "n.mcap", traces(Picks(**first))), 1.0).differences
