@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mushpipe.core.errors import UsageError
 from mushpipe.core.tables import Circles, Floats, Locations
-from mushpipe.core.types import Mask, Trace
+from mushpipe.core.types import Mask, RgbdFrame, Trace
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -116,7 +116,9 @@ def draw_pose(trace: Trace, settings: Mapping[str, Any], most: int = 3) -> Figur
     circles, locations = _last(trace, Circles), _last(trace, Locations)
     stage = Registration.model_validate(dict(settings))
     best = np.argsort(-circles.score, kind="stable")
-    tries = (stage.align(trace.frame, circles, locations, int(row), 0) for row in best)
+    # the frame that the stage got, where the recording has it: its depth may have been corrected
+    frame = ([trace.frame] + [value for _, value in _named(trace, RgbdFrame)])[-1]
+    tries = (stage.align(frame, circles, locations, int(row), 0) for row in best)
     pairs = zip(best, tries, strict=True)
     found = list(islice((pair for pair in pairs if pair[1] is not None), most))
     if not found:

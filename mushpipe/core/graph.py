@@ -240,5 +240,8 @@ def _translate(
             what = place + of if place else f"'{use}'"
             given = f", got {json.dumps(item['input'], default=str)}" if place else ""
             message = item["msg"].removeprefix("Value error, ")
+            if not place:  # of all settings together, which the command line may have changed
+                labels = [text for key, text in document.overrides.items() if key[:-1] == at]
+                given = f" (with {', '.join(labels)})" if labels else ""
             problems.append(document.problem(path, f"{what}: {message}{given}"))
     return problems

@@ -12,7 +12,7 @@ from pathlib import Path
 from mushpipe.core.capsule import write_capsule
 from mushpipe.core.chain import Chain, Passage, Turnstile, cores_shared, sink_inputs
 from mushpipe.core.edges import SinkThread, SourceThread, failure, interruptible_opening
-from mushpipe.core.errors import MushpipeError, StageError, UsageError
+from mushpipe.core.errors import InputError, MushpipeError, StageError, UsageError
 from mushpipe.core.manifest import build_manifest
 from mushpipe.core.overwriting import same_file
 from mushpipe.core.plan import Node, Plan
@@ -252,6 +252,9 @@ class _Runner:
                 if thread.failed_frame is not None:
                     self._save_capsule(thread.node, thread.failed_frame, thread.error)
         self.report.error = self.report.error or reader.error
+        if not (self.report.read or self.report.interrupted or self.report.error):
+            text = f"source '{self.plan.source.use}' gave no frame: there is nothing to run on"
+            self.report.error = InputError(text)
         if (last := self.last_failed) and not self.report.processed:
             text = f"none of {self.report.failed} frames could be processed; the last: {last}"
             self.report.error = self.report.error or StageError(text, last.exit_code)

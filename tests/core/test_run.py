@@ -27,10 +27,11 @@ def test_every_frame_goes_through_all_stages_in_order(lab: Lab):
     assert vars(report.sinks["out"]) == {"handed": 20, "consumed": 20, "dropped": 0, "failed": 0}
 
 
-def test_an_empty_source(lab: Lab):
+def test_a_source_without_frames_is_no_run(lab: Lab):
     report = lab.run(lab.chain("threshold"), "source.count=0")
     assert counts(report) == (0, 0, 0, 0)
-    assert report.exit_code == 0
+    assert report.exit_code == 4
+    assert str(report.error) == "source 'frames' gave no frame: there is nothing to run on"
 
 
 def test_max_frames_ends_the_run_and_closes_the_source(lab: Lab):
