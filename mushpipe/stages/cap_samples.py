@@ -57,22 +57,21 @@ def block(
     height, width = depth.shape
     u0, v0, half = place
     count, su, sv, sz, szz = 0, 0, 0, 0.0, 0.0
-    first = 0.0
     for v in range(max(0, v0 - half), min(height, v0 + half + 1)):
+        row = 0
         for u in range(max(0, u0 - half), min(width, u0 + half + 1)):
             z = float(depth[v, u])
-            if z <= 0.0 or ranks[v, u] < rank:
-                continue
-            if count == 0:
-                first = z
-            count += 1
-            su += u
-            sv += v
-            sz += z - first
-            szz += (z - first) * (z - first)
+            valid = (z > 0.0) & (ranks[v, u] >= rank)  # a factor is faster than a branch
+            row += valid
+            su += u * valid
+            sz += z * valid
+            szz += z * z * valid
+        count += row
+        sv += v * row
     if count:
-        out[0], out[1], out[2] = su / count, sv / count, first + sz / count
-        out[3] = max(szz / count - (sz / count) ** 2, 0.0)
+        mean = sz / count
+        out[0], out[1], out[2] = su / count, sv / count, mean
+        out[3] = max(szz / count - mean * mean, 0.0)
     return count
 
 

@@ -14,8 +14,8 @@ from mushpipe.stages.cap_samples import CELLS, GRID, block, ray_at
 Floats = NDArray[np.float64]
 COEFFICIENTS = 7
 TIP = 6  # the coefficient that says how pointed a cap is
-ROUNDS = 4
-DISC = 0.6  # points within so many radii; farther out a cap falls off faster than a paraboloid
+ROUNDS = 3
+DISC = 0.7  # points within so many radii; farther out a cap falls off faster than a paraboloid
 EFFECTIVE = 0.5  # as in cap-fit: so much of a point's information is its own
 SHAPE_M = 0.00025  # sigma of a cap about such a surface
 BEND = 0.3  # sigma of the quadratic coefficients about those of a cap, in radii
@@ -145,7 +145,7 @@ def paraboloid(points: Floats, size: float, surface: Floats, covariance: Floats)
     count = points.shape[1]
     weighted, right = np.empty((COEFFICIENTS, count)), np.empty(COEFFICIENTS)
     for k in range(ROUNDS):
-        cut = (100.0, 36.0, 16.0, 16.0)[k]
+        cut = (100.0, 25.0, 16.0)[k]
         for j in range(count):
             error = 0.0  # all count alike at first
             if k > 0:

@@ -12,7 +12,7 @@ from mushpipe.stages.paraboloid import ASPECT, COEFFICIENTS, SHAPE_M, TIP, fit_s
 from mushpipe.stages.upright import pixel_rays
 
 Floats = NDArray[np.float64]
-ASPECT_SIGMA = 0.15
+ASPECT_SIGMA = 0.2  # as in cap-fit
 LIP = 0.25  # what is below the rim's plane, over its radius
 OUTLINE = 0.008  # sigma of a cap's diameter about that of its outline, relative
 WHOLE = 0.85  # share of the grid that finds depth on a cap which nothing hides
