@@ -87,9 +87,7 @@ class _Runner:
             durations = self.report.durations[self.plan.source.name]
             reader = SourceThread(self.plan.source, source, threading.Event(), durations)
             info = self._begin(source, reader)
-            for node in self.plan.stages:
-                stack.enter_context(_opened(node, _opener(node)))
-            for node in self.plan.sinks:
+            for node in (*self.plan.stages, *self.plan.sinks):
                 stack.enter_context(_opened(node, _opener(node, info)))
             threads = [self._sink_thread(node) for node in self.plan.sinks]
             stack.enter_context(cores_shared())
@@ -106,9 +104,8 @@ class _Runner:
         on_error = self.plan.on_error or ("fail" if self.plan.replay() else "skip")
         self.tolerance = self.plan.max_failures if on_error == "skip" else 1
         with _named(self.plan.source):
-            self.report.device = source.describe()
-            device = {"device": self.report.device} if self.report.device else {}
-            manifest = {**self.report.manifest, **device}
+            device = self.report.device = source.describe()
+            manifest = {**self.report.manifest, **({"device": device} if device else {})}
             info = RunInfo(source.name(), manifest, source.live, lambda: reader.box.accepted)
             self._spare_files(source, info)
         return info
@@ -210,8 +207,7 @@ class _Runner:
             trace = passage.trace(left_ns)
             for thread in threads:
                 thread.box.put((passage.frame, sink_inputs(thread.node, trace)))
-        self.report.read = reader.box.accepted
-        self.report.dropped = reader.box.dropped
+        self.report.read, self.report.dropped = reader.box.accepted, reader.box.dropped
         if self.progress:
             self.progress(self.report)
         self.over = self._at_end(threads)
@@ -240,8 +236,7 @@ class _Runner:
             if edge.is_alive():
                 # A sink finishes what it was handed; a source may hang in a device.
                 edge.join(SOURCE_PATIENCE_S if edge is reader else None)
-        self.report.read = reader.box.accepted
-        self.report.dropped = reader.box.dropped
+        self.report.read, self.report.dropped = reader.box.accepted, reader.box.dropped
         self.report.waiting = reader.box.waiting + self.late
         self.report.elapsed_s = time.monotonic() - self.started
         self.report.source = source.counts()
@@ -252,12 +247,13 @@ class _Runner:
                 if thread.failed_frame is not None:
                     self._save_capsule(thread.node, thread.failed_frame, thread.error)
         self.report.error = self.report.error or reader.error
-        if not (self.report.read or self.report.interrupted or self.report.error):
+        nothing = not (self.report.error or self.report.processed)
+        if nothing and (last := self.last_failed):
+            text = f"none of {self.report.failed} frames could be processed; the last: {last}"
+            self.report.error = StageError(text, last.exit_code)
+        elif nothing and not (self.report.read or self.report.interrupted):
             text = f"source '{self.plan.source.use}' gave no frame: there is nothing to run on"
             self.report.error = InputError(text)
-        if (last := self.last_failed) and not self.report.processed:
-            text = f"none of {self.report.failed} frames could be processed; the last: {last}"
-            self.report.error = self.report.error or StageError(text, last.exit_code)
 
     def _save_capsule(self, node: Node, frame: RgbdFrame, error: Exception) -> None:
         if self.capsules is None or node.name in self.saved:
