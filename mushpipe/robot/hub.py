@@ -178,7 +178,8 @@ class Hub:
         """Encode what is the same for every client, once."""
         key = (result.seq, self.ledger.version, most)
         if self._cache is None or self._cache[0] != key:
-            free, offered = self.free(result), self.offered(result)
+            free = self.free(result)
+            offered = free[: self.settings.max_targets]
             sent = offered[:most]
             withheld: dict[Reason, int] = {
                 **result.choice.withheld,

@@ -61,7 +61,8 @@ class CapFit(Stage):
         depth = np.full((48, 64), 0.4, np.float32)
         # arrays of a frame are read-only, which to the compiler is a type of its own
         gray.flags.writeable = False
-        self.fit(gray, depth, camera, circles)
+        fits = self.fit(gray, depth, camera, circles)
+        self._bridge(np.arange(1), fits, depth, camera, circles)
 
     def process(self, frame: RgbdFrame, circles: Circles) -> tuple[Locations, Poses]:
         """Return one location and one pose per circle.

@@ -110,9 +110,11 @@ def sample_inner(
         out[0, m], out[1, m], out[2, m] = 1.0, x, y
         out[3, m], out[4, m], out[5, m] = x * x, x * y, y * y
         out[TIP, m] = np.sqrt(x * x + y * y + BLUNT * BLUNT) - BLUNT
-        out[7, m] = z - middle
+        out[COEFFICIENTS, m] = z - middle
         # part of the noise is shared by neighbouring pixels
-        out[8, m] = (sigma * (0.3 + 0.7 / np.sqrt(counts[j]))) ** 2 + SHAPE_M * SHAPE_M
+        out[COEFFICIENTS + 1, m] = (
+            sigma * (0.3 + 0.7 / np.sqrt(counts[j]))
+        ) ** 2 + SHAPE_M * SHAPE_M
         m += 1
     return m, middle
 
@@ -161,7 +163,7 @@ def paraboloid(points: Floats, size: float, surface: Floats, covariance: Floats)
             for m in range(i + 1):
                 covariance[i, m] = covariance[m, i] = dot(weighted[i], points[m], count)
         for i in range(3, COEFFICIENTS):
-            known = 1.0 / ((BEND if i < 6 else POINTED) * size) ** 2
+            known = 1.0 / ((BEND if i < TIP else POINTED) * size) ** 2
             covariance[i, i] += known
             right[i] += known * (0.5 * ASPECT * size if i == 3 or i == 5 else 0.0)
         if not invert(covariance):
