@@ -12,6 +12,7 @@ from typing import Any, TypeVar, cast
 
 import numba
 from numba import njit
+from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
 
 F = TypeVar("F", bound=Callable[..., Any])
 _FAST = {"reassoc", "contract", "arcp", "nsz"}
@@ -42,6 +43,24 @@ def _cache_folder() -> Path:
 
 if not os.environ.get("NUMBA_CACHE_DIR"):
     numba.config.CACHE_DIR = str(_cache_folder())  # type: ignore[attr-defined]
+
+
+class _SelfContained(JITCodeLibrary):
+    """A kernel with copies of all that it calls for itself.
+
+    numba lets the linker take the copy that was loaded first, be it another kernel's, optimised
+    beside other code. Sums in it may then be ordered otherwise, and results differ in their last
+    digits between the run that compiles and those that load what it compiled.
+    """
+
+    def _optimize_final_module(self) -> None:
+        for function in self._final_module.functions:
+            if not function.is_declaration and function.linkage.name == "linkonce_odr":
+                function.linkage = "internal"
+        super()._optimize_final_module()  # type: ignore[no-untyped-call]
+
+
+JITCPUCodegen._library_class = _SelfContained
 
 
 def jit(function: F) -> F:

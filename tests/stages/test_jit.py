@@ -51,6 +51,38 @@ def test_the_first_frame_compiles_nothing() -> None:
     assert done.stdout == 4 * "True 0\n", done.stderr
 
 
+HELPER = """
+from mushpipe.core.jit import jit
+import numpy as np
+@jit
+def longest(rows):
+    best = 0.0
+    for row in rows:
+        best = max(best, np.sort(row * row).sum())
+    return best
+@jit
+def kernel(rows):
+    return longest(rows) + longest(rows[1:]) + longest(rows[2:])
+kernel(np.ones((3, 3)))
+(code,) = kernel.inspect_asm().values()
+print("longest" in code, sum(".weak" in line and "longest" in line for line in code.splitlines()))
+"""
+
+
+def test_a_kernel_never_calls_the_copy_of_another(tmp_path: Path) -> None:
+    """Else it matters for the last digits what was compiled or loaded before."""
+    environment = {**os.environ, "PYTHONPATH": str(Path(mushpipe.__file__).parents[1])}
+    (tmp_path / "kernels.py").write_text(HELPER)
+    done = subprocess.run(
+        [sys.executable, str(tmp_path / "kernels.py")],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout == "True 0\n", done.stderr
+
+
 def test_kernels_run_where_numba_may_write_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[bool] = []
 
