@@ -13,23 +13,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
-from mushpipe.stages.phase_edges import Edges, Plane, Rows
+from mushpipe.stages.phase_edges import Edges, Plane, Rows, Shape
 from mushpipe.stages.phase_refit import (
     HIDDEN,
     NARROW,
-    Shape,
     Table,
+    around,
     fit_outline,
-    gather,
     tolerance,
     turned,
 )
-from mushpipe.stages.phase_steps import step_up
 
 MARGIN = 1.0  # px; so far within an accepted circle an outline counts as hidden by it
 SHADE = 3.0  # px; so far around an accepted circle, a lower one is shaded
 HOPELESS = 2e-5  # probability from which on nothing that is accepted later can help
 LIMIT = 2.5  # of a standardised feature: beyond the scenes of the training it says no more
+OWN = 24  # edge points with which an outline is fitted to what is its own
 TAKEN = 2.5  # px; edges so near an accepted outline are its own
 
 
@@ -138,9 +137,9 @@ def chance_beside(
 
 
 @jit
-def _use_up(edges: Edges, shape: Shape, number: int, owner: Rows, rows: Rows) -> None:
-    nothing = np.zeros((0, 0), np.float32)
-    count = gather(edges, nothing, 0.0, shape, NARROW, 1, rows)
+def _use_up(edges: Edges, shape: Shape, number: int, owner: Rows, scratch: Rows) -> None:
+    nothing, rows = np.zeros((0, 0), np.float32), scratch[0]
+    count = around(edges, nothing, 0.0, shape, NARROW, scratch)
     near = max(TAKEN, 1.3 * tolerance(shape[2]))
     for k in range(count):
         dx, dy = edges.x[rows[k]] - shape[0], edges.y[rows[k]] - shape[1]
@@ -175,7 +174,7 @@ def decide(
     n = len(shapes)
     owner = np.full(len(edges.x), -1, np.int32)
     chance, waiting = np.empty(n), np.ones(n, np.bool_)
-    order, rows = np.empty(n, np.int32), np.empty(4096, np.int32)
+    order, scratch = np.empty(n, np.int32), np.empty((2, len(edges.x)), np.int32)
     first, beside = neighbours(shapes)
     near = np.empty((n, 5))
     for k in range(n):
@@ -190,7 +189,7 @@ def decide(
         if best < 0:
             return order[:count], chance, owner
         waiting[best], order[count] = False, best
-        _use_up(edges, shapes[best], count, owner, rows)
+        _use_up(edges, shapes[best], count, owner, scratch)
         # Not only what it used up: what it hides, too, changes the odds of its neighbours.
         for k in beside[first[best] : first[best + 1]]:
             if waiting[k] and chance[k] > HOPELESS:
@@ -268,12 +267,13 @@ def polish(edges: Edges, height: Plane, pixel: float, outlines: Table, owner: Ro
     Edges of others do not count, nor those within or just outside a circle that was accepted
     before: where a cap dips under another one, its steepest shading is not its outline.
     """
-    rows, own = np.empty(4096, np.int32), np.empty(4096, np.int32)
+    scratch = np.empty((2, len(edges.x)), np.int32)
+    rows, own = scratch  # what is looked at no more takes what is its own
     shape = np.empty(5)
     for k in range(len(outlines)):
         shape[:] = outlines[k]
         near = _met(shape, outlines[:k])
-        count = gather(edges, height, step_up(shape[2] * pixel), shape, NARROW, 1, rows)
+        count = around(edges, height, pixel, shape, NARROW, scratch)
         kept = 0
         for m in range(count):
             row = rows[m]
@@ -282,7 +282,7 @@ def polish(edges: Edges, height: Plane, pixel: float, outlines: Table, owner: Ro
             if not _covered(edges.x[row], edges.y[row], near, -SHADE):
                 own[kept] = row
                 kept += 1
-        moved = fit_outline(edges, own, kept, shape, NARROW, 1) if kept >= 12 else False
+        moved = fit_outline(edges, own, kept, shape, NARROW) if kept >= OWN else False
         limit = max(1.5, 0.15 * outlines[k, 2])
         away = math.hypot(shape[0] - outlines[k, 0], shape[1] - outlines[k, 1])
         if moved and abs(shape[2] - outlines[k, 2]) < limit and away < limit:

@@ -115,8 +115,8 @@ class Relief:
         u = np.rint(edges.x - 2.5 * edges.nx).astype(int).clip(0, known.shape[1] - 1)
         v = np.rint(edges.y - 2.5 * edges.ny).astype(int).clip(0, known.shape[0] - 1)
         real = filled[v, u] != -1
-        kept = [column[real] for column in edges[:6]]
-        return Edges(kept[0], kept[1], kept[2], kept[3], kept[4], kept[5], edges.pixels)
+        kept = [column[real] for column in edges[:5]]
+        return Edges(kept[0], kept[1], kept[2], kept[3], kept[4], edges.pixels)
 
 
 def relief_of(frame: RgbdFrame) -> Relief | None:

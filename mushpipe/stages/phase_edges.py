@@ -12,6 +12,8 @@ from mushpipe.core.jit import jit
 Plane = NDArray[np.float32]
 Singles = NDArray[np.float32]
 Rows = NDArray[np.int32]
+Shape = NDArray[np.float64]
+UNSORTED = np.zeros(0, np.int32)
 SIGMA = 1.1
 DEPTH_ALONE = 0.6  # weight of a depth edge without a gray one
 # Between two caps the steepest step lies within the shaded rim, not on the outline. How far within
@@ -47,18 +49,18 @@ class Edges(NamedTuple):
         y: (M,) px.
         nx: (M,) unit normal, towards the brighter or higher side.
         ny: (M,)
-        strength: (M,) gradient over the threshold, at least 1.
         weight: (M,) how far its place can be trusted, 0..1; depth edges less than gray ones.
         pixels: (H, W) row of the edge point at a pixel, -1 for none.
+        starts: Where each column of each strip begins; empty before `in_strips`.
     """
 
     x: Singles
     y: Singles
     nx: Singles
     ny: Singles
-    strength: Singles
     weight: Singles
     pixels: Rows
+    starts: Rows = UNSORTED
 
 
 @jit
@@ -155,6 +157,40 @@ def _beyond_over_before(image: Plane, x: int, y: int, nx: float, ny: float) -> f
 
 
 @jit
+def _ridge(
+    above: Singles, here: Singles, below: Singles, gx: Singles, gy: Singles,
+    region: NDArray[np.uint8], threshold: float, maybe: NDArray[np.uint8],
+) -> None:  # fmt: skip
+    """Write where in a row a maximum along the gradient may lie: not on slopes that go on.
+
+    Args:
+        above: (W,) magnitude of the gradient in the row above.
+        here: (W,) in the row.
+        below: (W,) in the row below.
+        gx: (W,) gradient in the row.
+        gy: (W,)
+        region: (W,) where to look.
+        threshold: Least magnitude.
+        maybe: (W,) receives 0 or 1; the first and last pixel stay as they are.
+    """
+    least, half, slope_on = np.float32(threshold), np.float32(0.5), np.float32(1.1)
+    for x in range(len(here) - 2):  # without branches, and with no index below 0, for SIMD
+        m = here[x + 1]
+        right, left = gx[x + 1] >= half * m, gx[x + 1] < -half * m
+        down, up = gy[x + 1] >= half * m, gy[x + 1] < -half * m
+        top = above[x + 2] if right else (above[x] if left else above[x + 1])
+        middle = here[x + 2] if right else (here[x] if left else m)
+        bottom = below[x + 2] if right else (below[x] if left else below[x + 1])
+        ahead = bottom if down else (top if up else middle)
+        top = above[x] if right else (above[x + 2] if left else above[x + 1])
+        middle = here[x] if right else (here[x + 2] if left else m)
+        bottom = below[x] if right else (below[x + 2] if left else below[x + 1])
+        behind = top if down else (bottom if up else middle)
+        on = max(ahead, behind) <= slope_on * m
+        maybe[x + 1] = on & (m > least) & (region[x + 1] != 0)
+
+
+@jit
 def thin(
     image: Plane,
     gx: Plane,
@@ -185,18 +221,14 @@ def thin(
         The number of points; looking ends where `points` is full.
     """
     height, width = size.shape
-    count = 0
-    nearest, slope_on = np.float32(1.5), np.float32(1.1)
+    count, maybe = 0, np.zeros(width, np.uint8)
     for y in range(2, height - 2):
+        _ridge(size[y - 1], size[y], size[y + 1], gx[y], gy[y], region[y], threshold, maybe)
         for x in range(2, width - 2):
+            if maybe[x] == 0:
+                continue
             m = size[y, x]
-            if m <= threshold or region[y, x] == 0:
-                continue
             nx, ny = gx[y, x] / m, gy[y, x] / m
-            # most pixels lie on a slope that goes on: a look at both sides spares the interpolation
-            i, j = int(nx + nearest) - 1, int(ny + nearest) - 1
-            if size[y + j, x + i] > slope_on * m or size[y - j, x - i] > slope_on * m:
-                continue
             ahead = _at(size, x + nx, y + ny)
             behind = _at(size, x - nx, y - ny)
             if ahead > m or behind >= m:
@@ -231,14 +263,14 @@ def edges_of(
     weight = np.minimum(1, strength * np.float32(threshold / full))
     weight *= 1 - (1 - np.float32(BRIGHT_TRUST)) * share
     outward = np.float32(SHIFT) * share
-    return Edges(x - outward * nx, y - outward * ny, nx, ny, strength, weight, index)
+    return Edges(x - outward * nx, y - outward * ny, nx, ny, weight, index)
 
 
 def depth_edges(height: Plane, threshold: float) -> Edges:
     """Return the thin edges of a height map (H, W), all of the same weight."""
     region = np.ones(height.shape, np.uint8)
-    x, y, nx, ny, strength, _, index = _thin_edges(height, gradient_of(height), region, threshold)
-    return Edges(x, y, nx, ny, strength, np.full(len(x), DEPTH_ALONE, np.float32), index)
+    x, y, nx, ny, _, _, index = _thin_edges(height, gradient_of(height), region, threshold)
+    return Edges(x, y, nx, ny, np.full(len(x), DEPTH_ALONE, np.float32), index)
 
 
 def _thin_edges(

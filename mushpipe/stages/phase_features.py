@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
 from mushpipe.stages.linear import solve
-from mushpipe.stages.phase_edges import Gradient, Plane, Rows
-from mushpipe.stages.phase_refit import HIDDEN, Shape, Table, turned
+from mushpipe.stages.phase_edges import Gradient, Plane, Rows, Shape
+from mushpipe.stages.phase_refit import HIDDEN, Table, turned
 from mushpipe.stages.phase_steps import height_at, rise, step_up
 
 Bytes = NDArray[np.uint8]

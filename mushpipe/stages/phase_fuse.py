@@ -86,7 +86,6 @@ def fused(gray: Edges, depth: Edges, scale: float) -> Edges:
         np.concatenate([gray.y, y[alone]]),
         np.concatenate([gray.nx, depth.nx[alone]]),
         np.concatenate([gray.ny, depth.ny[alone]]),
-        np.concatenate([gray.strength, depth.strength[alone]]),
         np.concatenate([weight, depth.weight[alone]]),
         gray.pixels,
     )

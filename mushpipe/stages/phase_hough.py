@@ -27,6 +27,7 @@ from mushpipe.stages.phase_features import LEARNED, NAMES, kinds, static_feature
 from mushpipe.stages.phase_fuse import fused
 from mushpipe.stages.phase_learned import add_discs, agreement, candidates_of
 from mushpipe.stages.phase_refit import Table, refit
+from mushpipe.stages.phase_strips import in_strips
 from mushpipe.stages.phase_votes import CELL, peaks, rings_between, summed, vote
 from mushpipe.stages.verifier import load_verifier
 
@@ -197,7 +198,7 @@ class PhaseHough(Stage):
     ) -> Edges:
         otsu = max(otsu_of(gradient.size, _TOP), _FLOOR)
         edges = edges_of(image, gradient, region, self.edge * otsu, 1.2 * otsu)
-        return fused(edges, relief.edges(), CELL) if relief else edges
+        return in_strips(fused(edges, relief.edges(), CELL) if relief else edges)
 
     def _plausible(self, shapes: Table, middle: Table, relief: Relief | None) -> NDArray[np.bool_]:
         """Return which candidates have a possible diameter in metres, or none that is known."""

@@ -15,20 +15,18 @@ from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
 from mushpipe.stages.linear import solve
-from mushpipe.stages.phase_edges import Edges, Plane, Rows, Singles
-from mushpipe.stages.phase_steps import rise, step_up
+from mushpipe.stages.phase_edges import Edges, Plane, Rows, Shape, Singles
+from mushpipe.stages.phase_steps import step_up
+from mushpipe.stages.phase_strips import TURNED, gather, outline_hits
 
-Shape = NDArray[np.float64]
 Table = NDArray[np.float64]
 DIRECTIONS = 96
 # A wide fit, then a narrow one to the edge points around what it found; both of the radius.
 REACH = (0.3, 0.2)  # how far from the outline edge points are looked for
 SCALES = ((0.18, 0.1), (0.08, 0.05))  # the residual at which a weight has fallen to a quarter
 WIDE, NARROW = 0, 1
+LEAST = 8  # edge points, by their weight, that hold an outline in place
 OVAL = 0.12  # of the radius: expected size of p and q
-TURNED = 0.7  # cosine between an edge's normal and the radius
-ALIGNED = 0.8
-PER_DIRECTION = 3
 # Shading inside an outline draws the phase to smaller radii; a second start finds the outer ring.
 STARTS = (1.0, 1.3)
 SAME = 0.04  # of the radius
@@ -57,48 +55,6 @@ def tolerance(radius: float) -> float:
 
 
 @jit
-def gather(
-    edges: Edges, height: Plane, step: float, shape: Shape, stage: int, coarse: int, rows: Rows
-) -> int:
-    """Write the rows of edge points around an outline that face its centre; return their number.
-
-    Along each direction the pixels within `REACH` of the outline are looked at, and up to
-    `PER_DIRECTION` edge points taken; none where it is higher outside by `step` (m), for there
-    something nearer hides the outline. `stage` is `WIDE` or `NARROW`, `coarse` by how much fewer
-    directions are looked at.
-    """
-    x, y, radius = shape[0], shape[1], shape[2]
-    lines, width = edges.pixels.shape
-    count, n = 0, max(20, directions_of(radius) // coarse)
-    reach = max(3.0, REACH[stage] * radius)
-    cosine, sine = math.cos(2 * math.pi / n), math.sin(2 * math.pi / n)
-    c, s = cosine, -sine
-    for _ in range(n):
-        c, s = turned(c, s, cosine, sine)
-        if len(height) and rise(height, x, y, c, s, radius) > step:
-            continue
-        taken, last = 0, -1
-        inner = radius + shape[3] * (c * c - s * s) + shape[4] * 2 * s * c - reach
-        for k_t in range(int(2 * reach) + 1):
-            t = inner + k_t
-            u, v = int(x + t * c + 0.5), int(y + t * s + 0.5)
-            if t < 1 or u < 0 or v < 0 or u >= width or v >= lines:
-                continue
-            row = edges.pixels[v, u]
-            if row < 0 or row == last or -(c * edges.nx[row] + s * edges.ny[row]) < TURNED:
-                continue
-            last = row
-            rows[count] = row
-            count += 1
-            taken += 1
-            if taken == PER_DIRECTION or count == len(rows):
-                break
-        if count == len(rows):
-            break
-    return count
-
-
-@jit
 def _accumulate(
     edges: Edges, rows: Rows, count: int, shape: Shape, scale: float, a: Table, b: Table
 ) -> float:
@@ -108,22 +64,24 @@ def _accumulate(
     The Jacobian of a point is c, s, 1, cos 2t, sin 2t. Sums in variables of their own stay in
     registers: a third of the time of sums in an array.
     """
-    total = a00 = a01 = a02 = a03 = a04 = a11 = a12 = a13 = a14 = 0.0
-    a23 = a24 = a33 = a34 = a44 = b0 = b1 = b2 = b3 = b4 = 0.0
-    x, y, r, p, q = shape[0], shape[1], shape[2], shape[3], shape[4]
-    per_scale = 1 / scale
+    zero, one, two, least = np.float32(0), np.float32(1), np.float32(2), np.float32(TURNED)
+    total = a00 = a01 = a02 = a03 = a04 = a11 = a12 = a13 = a14 = zero
+    a23 = a24 = a33 = a34 = a44 = b0 = b1 = b2 = b3 = b4 = zero
+    x, y, r = np.float32(shape[0]), np.float32(shape[1]), np.float32(shape[2])
+    p, q, per_scale = np.float32(shape[3]), np.float32(shape[4]), np.float32(1 / scale)
     for k in range(count):  # without branches, so that SIMD does it
         row = np.uint32(rows[k])
         dx, dy = edges.x[row] - x, edges.y[row] - y
-        d = math.sqrt(dx * dx + dy * dy)
-        per_d = 1 / max(d, 1.0)
+        d = np.sqrt(dx * dx + dy * dy)
+        per_d = one / max(d, one)
         c, s = dx * per_d, dy * per_d
         facing = -(c * edges.nx[row] + s * edges.ny[row])
-        c2, s2 = c * c - s * s, 2 * s * c
+        c2, s2 = c * c - s * s, two * s * c
         e = d - (r + p * c2 + q * s2)
-        far = 1 + (e * per_scale) ** 2
+        off = e * per_scale
+        far = one + off * off
         w = edges.weight[row] * facing / (far * far)
-        w = w if (facing >= TURNED) & (d >= 1) else 0.0
+        w = w if (facing >= least) & (d >= one) else zero
         wc, ws, w3, w4 = w * c, w * s, w * c2, w * s2
         total += w
         a00, a01, a02, a03, a04 = a00 + wc * c, a01 + wc * s, a02 + wc, a03 + wc * c2, a04 + wc * s2
@@ -134,28 +92,23 @@ def _accumulate(
     a[1, 1], a[1, 2], a[1, 3], a[1, 4] = a11, a12, a13, a14
     a[2, 2], a[2, 3], a[2, 4], a[3, 3], a[3, 4], a[4, 4] = total, a23, a24, a33, a34, a44
     b[0], b[1], b[2], b[3], b[4] = b0, b1, b2, b3, b4
-    return total
+    return float(total)
 
 
 @jit
-def fit_outline(
-    edges: Edges, rows: Rows, count: int, shape: Shape, stage: int, times: float
-) -> bool:
-    """Improve x, y, r, p, q (5,) in place; False where the points do not hold it in place.
-
-    Each point stands for so many `times` points of the outline.
-    """
+def fit_outline(edges: Edges, rows: Rows, count: int, shape: Shape, stage: int) -> bool:
+    """Improve x, y, r, p, q (5,) in place; False where the points do not hold it in place."""
     start_x, start_y, start_r = shape[0], shape[1], shape[2]
     a, b = np.empty((5, 5)), np.empty(5)
     for scale_of_radius in SCALES[stage]:
         scale = max(1.0, scale_of_radius * shape[2])
-        if times * _accumulate(edges, rows, count, shape, scale, a, b) < 4:
+        if _accumulate(edges, rows, count, shape, scale, a, b) < LEAST:
             return False
-        prior = 4 / times / max(1.0, (OVAL * shape[2]) ** 2)
+        prior = 8 / max(1.0, (OVAL * shape[2]) ** 2)
         for m in range(5):
             for n in range(m):
                 a[m, n] = a[n, m]
-            a[m, m] += 0.3 / times
+            a[m, m] += 0.6
         for m in (3, 4):
             a[m, m] += prior
             b[m] -= prior * shape[m]
@@ -169,47 +122,22 @@ def fit_outline(
 
 
 @jit
-def fit_around(
-    edges: Edges, height: Plane, pixel: float, shape: Shape, stage: int, rows: Rows
-) -> bool:
-    """Fit an outline (5,) to the edge points around it, in place; False if they do not hold it."""
-    count = gather(edges, height, step_up(shape[2] * pixel), shape, stage, 2, rows)
-    return count >= 5 and fit_outline(edges, rows, count, shape, stage, 2)
+def around(
+    edges: Edges, height: Plane, pixel: float, shape: Shape, stage: int, scratch: Rows
+) -> int:
+    """Write the rows of edge points around an outline into `scratch[0]`; return how many."""
+    reach = max(3.0, REACH[stage] * shape[2])
+    relief = height if stage == NARROW else height[:0]
+    return gather(edges, relief, step_up(shape[2] * pixel), shape, reach, scratch)
 
 
 @jit
-def outline_hits(edges: Edges, shape: Shape, hits: Rows) -> tuple[int, int, float]:
-    """Write per direction the row of the nearest edge point that supports the outline, else -1.
-
-    Returns:
-        The number of directions, of hits, and the root mean square distance of the hits (px).
-    """
-    height, width = edges.pixels.shape
-    x, y, r = shape[0], shape[1], shape[2]
-    n, near = directions_of(r), tolerance(r)
-    found, squares = 0, 0.0
-    hits[:] = -2
-    cosine, sine = math.cos(2 * math.pi / n), math.sin(2 * math.pi / n)
-    c, s = cosine, -sine
-    for k in range(n):
-        c, s = turned(c, s, cosine, sine)
-        radius = r + shape[3] * (c * c - s * s) + shape[4] * 2 * s * c
-        best, hits[k] = near, -1
-        for step in range(int(2 * near) + 5):  # an edge may be entered up to 3 px within its place
-            t = radius - near - 3 + step
-            u, v = int(x + t * c + 0.5), int(y + t * s + 0.5)
-            if u < 0 or v < 0 or u >= width or v >= height:
-                continue
-            row = edges.pixels[v, u]
-            if row < 0 or -(c * edges.nx[row] + s * edges.ny[row]) < ALIGNED:
-                continue
-            away = abs((edges.x[row] - x) * c + (edges.y[row] - y) * s - radius)
-            if away < best:
-                best, hits[k] = away, row
-        if hits[k] >= 0:
-            found += 1
-            squares += best * best
-    return n, found, math.sqrt(squares / max(found, 1))
+def fit_around(
+    edges: Edges, height: Plane, pixel: float, shape: Shape, stage: int, scratch: Rows
+) -> bool:
+    """Fit an outline (5,) to the edge points around it, in place; False if they do not hold it."""
+    count = around(edges, height, pixel, shape, stage, scratch)
+    return count >= 2 * LEAST and fit_outline(edges, scratch[0], count, shape, stage)
 
 
 @jit
@@ -233,7 +161,7 @@ def refit(
     n = len(candidates) * len(STARTS)
     shapes, residual = np.empty((n, 5)), np.empty(n, np.float32)
     hits = np.full((n, DIRECTIONS), -2, np.int32)
-    rows = np.empty(PER_DIRECTION * DIRECTIONS, np.int32)
+    scratch = np.empty((2, len(edges.x)), np.int32)
     kept = tried = 0
     firm = np.zeros(len(candidates), np.bool_)
     wide, following = np.empty((n, 5)), np.empty((2, n), np.int32)
@@ -247,19 +175,20 @@ def refit(
             shape[0], shape[1] = candidates[k, 0], candidates[k, 1]
             shape[2] = min(largest, start * candidates[k, 2])
             shape[3] = shape[4] = 0
-            if not fit_around(edges, height, pixel, shape, WIDE, rows):
+            if not fit_around(edges, height, pixel, shape, WIDE, scratch):
                 continue
             if _known(shape, wide, cells[WIDE], following[WIDE]):
                 continue  # from there the narrow fit comes to what it came to before
             wide[tried] = shape
             _enter(shape, tried, cells[WIDE], following[WIDE])
             tried += 1
-            if not fit_around(edges, height, pixel, shape, NARROW, rows):
+            if not fit_around(edges, height, pixel, shape, NARROW, scratch):
                 continue
             within = smallest * 0.9 <= shape[2] <= largest * 1.1
             if not within or _known(shape, shapes, cells[NARROW], following[NARROW]):
                 continue
-            n, found, residual[kept] = outline_hits(edges, shape, hits[kept])
+            n, near = directions_of(shape[2]), tolerance(shape[2])
+            found, residual[kept] = outline_hits(edges, shape, near, n, hits[kept], scratch)
             firm[k] = found > FIRM * n
             if found >= FAINT * n:
                 _enter(shape, kept, cells[NARROW], following[NARROW])

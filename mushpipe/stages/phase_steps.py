@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from mushpipe.core.jit import jit
 from mushpipe.stages.phase_edges import Plane
 
@@ -18,9 +20,10 @@ def step_up(radius: float) -> float:
 def height_at(height: Plane, x: float, y: float) -> float:
     """Return the height (m) at an image point; -1 where it is unknown."""
     u, v = int((x + 0.5) * 0.5), int((y + 0.5) * 0.5)
-    if x < 0 or y < 0 or u >= height.shape[1] or v >= height.shape[0]:
-        return -1.0
-    return float(height[v, u])
+    right, bottom = height.shape[1] - 1, height.shape[0] - 1
+    inside = (x >= 0) & (y >= 0) & (u <= right) & (v <= bottom)  # without branches, for SIMD
+    value = height[np.uint32(min(max(v, 0), bottom)), np.uint32(min(max(u, 0), right))]
+    return float(value) if inside else -1.0
 
 
 @jit
@@ -37,6 +40,4 @@ def rise(height: Plane, x: float, y: float, c: float, s: float, radius: float) -
     for k in range(3):
         t = radius * (1.12 + 0.08 * k) + 1.5
         outside = max(outside, height_at(height, x + t * c, y + t * s))
-    if inside == -1 or outside == -1:
-        return 0.0
-    return outside - inside
+    return outside - inside if (inside != -1) & (outside != -1) else 0.0

@@ -1,0 +1,245 @@
+"""Edge points in strips of the image, so that those around an outline lie side by side in memory.
+
+A ring around a centre crosses a few strips, and in each the points between two columns are one
+range: SIMD looks at all of them in a fraction of the time that it takes to look up their pixels.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from mushpipe.core.jit import jit
+from mushpipe.stages.phase_edges import Edges, Plane, Rows, Shape
+from mushpipe.stages.phase_steps import rise
+
+STRIP = 16  # px
+AROUND = 32  # sectors of an outline in which it is looked for what hides it
+# They are as wide as each other in |cos| + |sin| = 1, where a point's sector needs no arc tangent.
+_SIDE = np.repeat([1, -1], AROUND // 2)
+_ACROSS = _SIDE * np.tile(1 - np.arange(1, AROUND, 2) * 2 / AROUND, 2)
+_ALONG = _SIDE * (1 - abs(_ACROSS))
+COSINE, SINE = np.array([_ACROSS, _ALONG]) / np.hypot(_ACROSS, _ALONG)
+TURNED = 0.7  # cosine between an edge's normal and the radius
+ALIGNED = 0.8  # the same, for edges that support an outline
+RAY = np.float32(0.75)  # px; so far beside a direction an edge may lie
+A1, A3, A5 = np.float32(0.9998660), np.float32(-0.3302995), np.float32(0.1801410)
+A7, A9 = np.float32(-0.0851330), np.float32(0.0208351)
+QUARTER, FULL = np.float32(math.pi / 2), np.float32(2 * math.pi)
+
+
+@jit
+def _sort(points: Plane, pixels: Rows) -> tuple[Plane, Rows]:
+    """Return points (C, M), x and y first, by strip and column, and where each column begins.
+
+    Their new rows are written into the index of pixels (H, W).
+    """
+    height, width = pixels.shape
+    count = points.shape[1]
+    starts = np.zeros((height // STRIP + 1) * width + 1, np.int32)
+    cell, new = np.empty(count, np.int32), np.empty(count, np.int32)
+    for k in range(count):
+        u = min(max(int(points[0, k]), 0), width - 1)
+        cell[k] = min(max(int(points[1, k]), 0), height - 1) // STRIP * width + u
+        starts[cell[k] + 1] += 1
+    for k in range(1, len(starts)):
+        starts[k] += starts[k - 1]
+    free, out = starts.copy(), np.empty_like(points)
+    for k in range(count):
+        new[k] = free[cell[k]]
+        free[cell[k]] += 1
+    for column in range(len(points)):
+        for k in range(count):
+            out[column, new[k]] = points[column, k]
+    for v in range(height):
+        for u in range(width):
+            if pixels[v, u] >= 0:
+                pixels[v, u] = new[pixels[v, u]]
+    return out, starts
+
+
+def in_strips(edges: Edges) -> Edges:
+    """Return edge points in the order of their strips; `pixels` is rewritten in place."""
+    points, starts = _sort(np.stack(edges[:5]), edges.pixels)
+    x, y, nx, ny, weight = points
+    return Edges(x, y, nx, ny, weight, edges.pixels, starts)
+
+
+@jit
+def _sector(dx: float, dy: float) -> int:
+    """Return the sector of a direction."""
+    across = dx / (abs(dx) + abs(dy))
+    turn = 1 - across if dy >= 0 else 3 + across
+    return int(turn * (AROUND / 4)) % AROUND
+
+
+@jit
+def _uncovered(
+    edges: Edges, height: Plane, step: float, shape: Shape, rows: Rows, count: int
+) -> int:
+    """Keep the rows of points in whose sector nothing stands higher; return their number."""
+    hidden, some = np.empty(AROUND, np.int32), 0
+    for k in range(AROUND):
+        up = rise(height, shape[0], shape[1], COSINE[k], SINE[k], shape[2])
+        hidden[k] = up > step
+        some += hidden[k]
+    if some == 0:
+        return count
+    kept = 0
+    for k in range(count):
+        row = rows[k]
+        rows[kept] = row
+        kept += 1 - hidden[_sector(edges.x[row] - shape[0], edges.y[row] - shape[1])]
+    return kept
+
+
+@jit
+def _strips(edges: Edges, shape: Shape, outer: float) -> tuple[int, int]:
+    """Return the strips, from and up to, that a circle around an outline's centre crosses."""
+    last = min(edges.pixels.shape[0] - 1, int(shape[1] + outer))
+    return max(0, int(shape[1] - outer)) // STRIP, last // STRIP + 1
+
+
+@jit
+def _span(edges: Edges, shape: Shape, outer: float, strip: int) -> tuple[int, int]:
+    """Return the rows, from and up to, of the points of a strip that may lie in such a circle."""
+    width = edges.pixels.shape[1]
+    away = max(strip * STRIP - shape[1], shape[1] - (strip + 1) * STRIP, 0.0)
+    half = math.sqrt(max(0.0, outer * outer - away * away))
+    left = min(max(0, int(shape[0] - half)), width)
+    right = max(min(width - 1, int(shape[0] + half)), left - 1)
+    return edges.starts[strip * width + left], edges.starts[strip * width + right + 1]
+
+
+@jit
+def _around(edges: Edges, low: int, shape: Shape, reach: float, near: Rows) -> None:
+    """Write whether the points from a row on lie within `reach` of an outline and face its centre.
+
+    In single precision and without branches, so that SIMD does it.
+    """
+    x, y, r = np.float32(shape[0]), np.float32(shape[1]), np.float32(shape[2])
+    p, q = np.float32(shape[3]), np.float32(2 * shape[4])
+    one, cosine, far = np.float32(1), np.float32(TURNED**2), np.float32(reach)
+    for i in range(len(near)):
+        k = np.uint32(low + i)
+        dx, dy = edges.x[k] - x, edges.y[k] - y
+        square = dx * dx + dy * dy
+        safe = max(square, one)
+        away = dx * edges.nx[k] + dy * edges.ny[k]
+        e = np.sqrt(safe) - r - (p * (dx * dx - dy * dy) + q * dx * dy) / safe
+        facing = (away < 0) & (away * away >= cosine * square)
+        near[i] = facing & (abs(e) <= far) & (square >= one)
+
+
+@jit
+def gather(
+    edges: Edges, height: Plane, step: float, shape: Shape, reach: float, scratch: Rows
+) -> int:
+    """Write which edge points around an outline face its centre into `scratch[0]`; return how many.
+
+    None where it is higher outside by `step` (m), for there something nearer hides the outline.
+
+    Args:
+        edges: Edge points.
+        height: (h, w) m at half resolution, -1 where unknown; empty without depth.
+        step: m
+        shape: (5,) the outline.
+        reach: How far (px) from it points are looked for.
+        scratch: (2, M), M the number of all edge points.
+    """
+    rows, count = scratch[0], 0
+    outer = shape[2] + abs(shape[3]) + abs(shape[4]) + reach
+    first, last = _strips(edges, shape, outer)
+    for strip in range(first, last):
+        low, high = _span(edges, shape, outer, strip)
+        near = scratch[1, : high - low]
+        _around(edges, low, shape, reach, near)
+        for i in range(high - low):
+            rows[count] = low + i
+            count += near[i]
+    return _uncovered(edges, height, step, shape, rows, count) if len(height) else count
+
+
+@jit
+def _turn(dx: np.float32, dy: np.float32) -> np.float32:
+    """Return the angle (0..2 pi) of a direction, to 1e-5.
+
+    Abramowitz & Stegun (1964), 4.4.49; without branches, so that SIMD does it.
+    """
+    across, along = abs(dx), abs(dy)
+    t = min(across, along) / max(across, along)
+    u = t * t
+    angle = A1 + u * (A3 + u * (A5 + u * (A7 + u * A9)))
+    angle = QUARTER - t * angle if along > across else t * angle
+    angle = QUARTER + QUARTER - angle if dx < 0 else angle
+    return FULL - angle if dy < 0 else angle
+
+
+@jit
+def _beside(edges: Edges, low: int, shape: Shape, near: float, n: int, at: Rows, off: Rows) -> None:
+    """Write at which of n directions the points from a row on support an outline, -1 for none.
+
+    Args:
+        edges: Edge points.
+        low: The first row.
+        shape: (5,)
+        near: How far (px) from the outline a point may lie.
+        n: Number of directions.
+        at: (K,) receives the directions.
+        off: (K,) receives the distances from the outline, in 1/1000 px.
+    """
+    x, y, r = np.float32(shape[0]), np.float32(shape[1]), np.float32(shape[2])
+    p, q = np.float32(shape[3]), np.float32(2 * shape[4])
+    one, cosine, far = np.float32(1), np.float32(ALIGNED**2), np.float32(near)
+    gap = np.float32(2 * math.pi * shape[2] / n)
+    per_turn, half, fine = np.float32(n / (2 * math.pi)), np.float32(0.5), np.float32(1000)
+    for i in range(len(at)):
+        k = np.uint32(low + i)
+        dx, dy = edges.x[k] - x, edges.y[k] - y
+        square = max(dx * dx + dy * dy, one)
+        away = dx * edges.nx[k] + dy * edges.ny[k]
+        e = abs(np.sqrt(square) - r - (p * (dx * dx - dy * dy) + q * dx * dy) / square)
+        supports = (away < 0) & (away * away >= cosine * square) & (e < far)
+        turn = _turn(dx, dy) * per_turn + half
+        place = np.int32(turn)
+        beside = abs(turn - np.float32(place) - half) * gap < RAY
+        at[i] = place if supports & beside else -1
+        off[i] = np.int32(e * fine)
+
+
+@jit
+def outline_hits(
+    edges: Edges, shape: Shape, near: float, n: int, hits: Rows, scratch: Rows
+) -> tuple[int, float]:
+    """Write per direction the row of the nearest edge point that supports the outline, else -1.
+
+    Args:
+        edges: Edge points.
+        shape: (5,)
+        near: How far (px) from the outline a point may lie.
+        n: Number of directions.
+        hits: (D,) receives the rows, and -2 beyond the last direction.
+        scratch: (2, M)
+
+    Returns:
+        The number of hits, and the root mean square of their distances (px).
+    """
+    best = np.full(n, 2**30, np.int32)
+    hits[:n], hits[n:] = -1, -2
+    outer = shape[2] + abs(shape[3]) + abs(shape[4]) + near
+    first, last = _strips(edges, shape, outer)
+    for strip in range(first, last):
+        low, high = _span(edges, shape, outer, strip)
+        at, off = scratch[0, : high - low], scratch[1, : high - low]
+        _beside(edges, low, shape, near, n, at, off)
+        for i in range(high - low):
+            direction = at[i] % n
+            if at[i] >= 0 and off[i] < best[direction]:
+                best[direction], hits[direction] = off[i], low + i
+    found, squares = 0, 0.0
+    for direction in range(n):
+        if hits[direction] >= 0:
+            found += 1
+            squares += (0.001 * best[direction]) ** 2
+    return found, math.sqrt(squares / max(found, 1))

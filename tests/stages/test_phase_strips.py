@@ -1,0 +1,104 @@
+"""Edge points in strips, against looking at every point there is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from mushpipe.stages.phase_edges import Edges
+from mushpipe.stages.phase_strips import ALIGNED, RAY, TURNED, gather, in_strips, outline_hits
+
+Points = NDArray[np.float64]
+NOTHING = np.zeros((0, 0), np.float32)
+SHAPES = st.tuples(
+    st.floats(-20, 180), st.floats(-20, 140), st.floats(5, 90), st.floats(-4, 4), st.floats(-4, 4)
+)
+
+
+def scattered(seed: int, width: int = 160, height: int = 120, count: int = 1500) -> Edges:
+    """Edge points at places and with normals at random; each is entered at its pixel."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(0, width - 1, count), rng.uniform(0, height - 1, count)
+    angle = rng.uniform(0, 2 * np.pi, count)
+    weight = rng.uniform(0.1, 1, count)
+    pixels = np.full((height, width), -1, np.int32)
+    pixels[np.rint(y).astype(int), np.rint(x).astype(int)] = np.arange(count)
+    columns = (x, y, np.cos(angle), np.sin(angle), weight)
+    return Edges(*(column.astype(np.float32) for column in columns), pixels)
+
+
+def seen_from(
+    edges: Edges, shape: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return the angle of all points, their distance from an outline, the cosine to its inside."""
+    dx, dy = edges.x - shape[0], edges.y - shape[1]
+    angle, d = np.arctan2(dy, dx), np.hypot(dx, dy)
+    outline = shape[2] + shape[3] * np.cos(2 * angle) + shape[4] * np.sin(2 * angle)
+    facing = -(np.cos(angle) * edges.nx + np.sin(angle) * edges.ny)
+    return angle, np.where(d < 1, np.inf, abs(d - outline)), facing
+
+
+def test_strips_only_reorder() -> None:
+    before = scattered(1)
+    after = in_strips(before._replace(pixels=before.pixels.copy()))
+    old, new = np.stack(before[:5]), np.stack(after[:5])
+    assert (old[:, np.lexsort(old)] == new[:, np.lexsort(new)]).all()
+    entered = before.pixels >= 0
+    assert (entered == (after.pixels >= 0)).all()
+    assert (old[:, before.pixels[entered]] == new[:, after.pixels[entered]]).all()
+
+
+@given(seed=st.integers(0, 5), shape=SHAPES, reach=st.floats(1, 30))
+def test_all_points_around_an_outline_are_found(
+    seed: int, shape: tuple[float, ...], reach: float
+) -> None:
+    edges, outline = in_strips(scattered(seed)), np.array(shape)
+    scratch = np.empty((2, len(edges.x)), np.int32)
+    found = scratch[0, : gather(edges, NOTHING, 0.0, outline, reach, scratch)]
+    _, off, facing = seen_from(edges, outline)
+    surely = (off < reach - 1e-3) & (facing > TURNED + 1e-3)
+    perhaps = (off < reach + 1e-3) & (facing > TURNED - 1e-3)
+    assert set(np.flatnonzero(surely)) <= set(found) <= set(np.flatnonzero(perhaps))
+    assert len(set(found)) == len(found)
+
+
+def test_none_where_something_higher_hides_the_outline() -> None:
+    edges, outline = in_strips(scattered(2)), np.array([80.0, 60.0, 30.0, 0.0, 0.0])
+    height = np.zeros((60, 80), np.float32)
+    height[:, 56:] = 0.05  # from x = 112 on, 2 px beyond the outline's rightmost point
+    scratch = np.empty((2, len(edges.x)), np.int32)
+    found = scratch[0, : gather(edges, height, 0.01, outline, 6.0, scratch)]
+    angle, off, facing = seen_from(edges, outline)
+    around = np.flatnonzero((off < 5.99) & (facing > TURNED + 1e-3))
+    hidden = around[abs(angle[around]) < np.radians(15)]
+    free = around[abs(angle[around]) > np.radians(60)]
+    assert len(hidden) > 3
+    assert not set(hidden) & set(found)
+    assert set(free) <= set(found)
+
+
+@given(seed=st.integers(0, 5), shape=SHAPES, n=st.integers(20, 96))
+def test_each_direction_gets_its_nearest_point(seed: int, shape: tuple[float, ...], n: int) -> None:
+    edges, outline, near = in_strips(scattered(seed)), np.array(shape), 4.0
+    hits, scratch = np.zeros(96, np.int32), np.empty((2, len(edges.x)), np.int32)
+    count, rms = outline_hits(edges, outline, near, n, hits, scratch)
+    angle, off, facing = seen_from(edges, outline)
+    turn = angle % (2 * np.pi) / (2 * np.pi) * n
+    beside = abs(turn - np.rint(turn)) * 2 * np.pi * outline[2] / n
+    surely = (off < near - 1e-2) & (facing > ALIGNED + 1e-3) & (beside < RAY - 1e-2)
+    perhaps = (off < near + 1e-2) & (facing > ALIGNED - 1e-3) & (beside < RAY + 1e-2)
+    direction = np.rint(turn).astype(int) % n
+    for k in range(n):
+        sure, maybe = np.flatnonzero(surely & (direction == k)), perhaps & (direction == k)
+        if hits[k] < 0:
+            assert len(sure) == 0
+            continue
+        assert maybe[hits[k]]
+        assert off[hits[k]] <= off[sure].min(initial=np.inf) + 2e-3
+    assert count == (hits[:n] >= 0).sum()
+    assert (hits[n:] == -2).all()
+    if count:
+        assert rms == pytest.approx(np.sqrt((off[hits[:n][hits[:n] >= 0]] ** 2).mean()), abs=2e-3)
