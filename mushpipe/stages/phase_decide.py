@@ -13,16 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
-from mushpipe.stages.phase_edges import Edges, Plane, Rows, Shape
+from mushpipe.stages.phase_edges import Plane, Rows, Shape
 from mushpipe.stages.phase_refit import (
+    COSINES,
     HIDDEN,
     NARROW,
+    SINES,
     Table,
     around,
     fit_outline,
     tolerance,
-    turned,
 )
+from mushpipe.stages.phase_strips import Strips
 
 MARGIN = 1.0  # px; so far within an accepted circle an outline counts as hidden by it
 SHADE = 3.0  # px; so far around an accepted circle, a lower one is shaded
@@ -75,23 +77,19 @@ def _covered(x: float, y: float, accepted: Table, margin: float) -> bool:
 
 @jit
 def outline_features(
-    edges: Edges, shape: Shape, hits: Rows, owner: Rows, accepted: Table, row: Table
+    edges: Strips, shape: Shape, hits: Rows, owner: Rows, accepted: Table, row: Table
 ) -> None:
     """Write free, support, trust and hits into row[0..3].
 
     A direction is hidden where depth says so (`HIDDEN`), or where it lies within an accepted circle
     and has no edge of its own left.
     """
-    height, width = edges.pixels.shape
     n, inside, free, found, weight = 0, 0, 0, 0, 0.0
     while n < len(hits) and hits[n] != -2:
         n += 1
-    cosine, sine = math.cos(2 * math.pi / max(n, 1)), math.sin(2 * math.pi / max(n, 1))
-    c, s = cosine, -sine
     for k in range(n):
-        c, s = turned(c, s, cosine, sine)
-        x, y = shape[0] + shape[2] * c, shape[1] + shape[2] * s
-        if x < 0 or y < 0 or x > width - 1 or y > height - 1:
+        x, y = shape[0] + shape[2] * COSINES[n, k], shape[1] + shape[2] * SINES[n, k]
+        if x < 0 or y < 0 or x > edges.width - 1 or y > edges.height - 1:
             continue
         inside += 1
         if hits[k] == HIDDEN:
@@ -127,7 +125,7 @@ def probability(row: Table, weights: Table) -> float:
 
 @jit
 def chance_beside(
-    edges: Edges, shape: Shape, hits: Rows, owner: Rows, accepted: Table, row: Table,
+    edges: Strips, shape: Shape, hits: Rows, owner: Rows, accepted: Table, row: Table,
     weights: Table,
 ) -> float:  # fmt: skip
     """Return the probability of a candidate beside the accepted; writes what depends on them."""
@@ -137,7 +135,7 @@ def chance_beside(
 
 
 @jit
-def _use_up(edges: Edges, shape: Shape, number: int, owner: Rows, scratch: Rows) -> None:
+def _use_up(edges: Strips, shape: Shape, number: int, owner: Rows, scratch: Rows) -> None:
     nothing, rows = np.zeros((0, 0), np.float32), scratch[0]
     count = around(edges, nothing, 0.0, shape, NARROW, scratch)
     near = max(TAKEN, 1.3 * tolerance(shape[2]))
@@ -152,7 +150,7 @@ def _use_up(edges: Edges, shape: Shape, number: int, owner: Rows, scratch: Rows)
 
 @jit
 def decide(
-    edges: Edges, shapes: Table, hits: Rows, table: Table, model: Rows,
+    edges: Strips, shapes: Table, hits: Rows, table: Table, model: Rows,
     weights: NDArray[np.float64], least: float,
 ) -> tuple[Rows, Table, Rows]:  # fmt: skip
     """Accept candidates in the order of their probability.
@@ -261,7 +259,7 @@ def _met(shape: Shape, accepted: Table) -> Table:
 
 
 @jit
-def polish(edges: Edges, height: Plane, pixel: float, outlines: Table, owner: Rows) -> None:
+def polish(edges: Strips, height: Plane, pixel: float, outlines: Table, owner: Rows) -> None:
     """Refit accepted outlines (K, 5), in their order and in place, to what is theirs alone.
 
     Edges of others do not count, nor those within or just outside a circle that was accepted

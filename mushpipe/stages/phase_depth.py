@@ -107,7 +107,7 @@ class Relief:
         self.pixel = float(np.median(known[:: max(1, len(known) // 2000)])) / focal
 
     def edges(self) -> Edges:
-        """Return the depth discontinuities, in px of the height map; `pixels` is not kept up."""
+        """Return the depth discontinuities, in px of the height map."""
         filled = closed(self.height)
         known = np.maximum(filled, 0)
         edges = depth_edges(known, STEEP * CELL * self.pixel)
@@ -115,8 +115,7 @@ class Relief:
         u = np.rint(edges.x - 2.5 * edges.nx).astype(int).clip(0, known.shape[1] - 1)
         v = np.rint(edges.y - 2.5 * edges.ny).astype(int).clip(0, known.shape[0] - 1)
         real = filled[v, u] != -1
-        kept = [column[real] for column in edges[:5]]
-        return Edges(kept[0], kept[1], kept[2], kept[3], kept[4], edges.pixels)
+        return Edges(*(column[real] for column in edges))
 
 
 def relief_of(frame: RgbdFrame) -> Relief | None:

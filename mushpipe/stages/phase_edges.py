@@ -13,7 +13,6 @@ Plane = NDArray[np.float32]
 Singles = NDArray[np.float32]
 Rows = NDArray[np.int32]
 Shape = NDArray[np.float64]
-UNSORTED = np.zeros(0, np.int32)
 SIGMA = 1.1
 DEPTH_ALONE = 0.6  # weight of a depth edge without a gray one
 # Between two caps the steepest step lies within the shaded rim, not on the outline. How far within
@@ -50,8 +49,6 @@ class Edges(NamedTuple):
         nx: (M,) unit normal, towards the brighter or higher side.
         ny: (M,)
         weight: (M,) how far its place can be trusted, 0..1; depth edges less than gray ones.
-        pixels: (H, W) row of the edge point at a pixel, -1 for none.
-        starts: Where each column of each strip begins; empty before `in_strips`.
     """
 
     x: Singles
@@ -59,8 +56,6 @@ class Edges(NamedTuple):
     nx: Singles
     ny: Singles
     weight: Singles
-    pixels: Rows
-    starts: Rows = UNSORTED
 
 
 @jit
@@ -248,7 +243,7 @@ def thin(
 
 def edges_of(
     image: Plane, grad: Gradient, region: NDArray[np.uint8], threshold: float, full: float
-) -> Edges:
+) -> tuple[Edges, Rows]:
     """Return the thin edges of an image in the place of the outlines they stand for.
 
     Args:
@@ -257,20 +252,23 @@ def edges_of(
         region: (H, W) where to look.
         threshold: Least gradient.
         full: Gradient from which on an edge has its full weight.
+
+    Returns:
+        The edges, and (H, W) the row of the edge that was found at a pixel, -1 for none.
     """
     x, y, nx, ny, strength, bright, index = _thin_edges(image, grad, region, threshold)
     share = np.clip((bright - DIM) / (BRIGHT - DIM), 0, 1).astype(np.float32)
     weight = np.minimum(1, strength * np.float32(threshold / full))
     weight *= 1 - (1 - np.float32(BRIGHT_TRUST)) * share
     outward = np.float32(SHIFT) * share
-    return Edges(x - outward * nx, y - outward * ny, nx, ny, weight, index)
+    return Edges(x - outward * nx, y - outward * ny, nx, ny, weight), index
 
 
 def depth_edges(height: Plane, threshold: float) -> Edges:
     """Return the thin edges of a height map (H, W), all of the same weight."""
     region = np.ones(height.shape, np.uint8)
-    x, y, nx, ny, _, _, index = _thin_edges(height, gradient_of(height), region, threshold)
-    return Edges(x, y, nx, ny, np.full(len(x), DEPTH_ALONE, np.float32), index)
+    x, y, nx, ny, _, _, _ = _thin_edges(height, gradient_of(height), region, threshold)
+    return Edges(x, y, nx, ny, np.full(len(x), DEPTH_ALONE, np.float32))
 
 
 def _thin_edges(

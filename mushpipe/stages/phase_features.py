@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from mushpipe.core.jit import jit
 from mushpipe.stages.linear import solve
 from mushpipe.stages.phase_edges import Gradient, Plane, Rows, Shape
-from mushpipe.stages.phase_refit import HIDDEN, Table, turned
-from mushpipe.stages.phase_steps import height_at, rise, step_up
+from mushpipe.stages.phase_refit import COSINES, HIDDEN, SINES, Table
+from mushpipe.stages.phase_steps import height_at, rises, step_up
 
 Bytes = NDArray[np.uint8]
 
@@ -58,6 +58,8 @@ _COSINES, _SINES = np.cos(_TURNS), np.sin(_TURNS)
 _U, _V = (axis.ravel() for axis in np.meshgrid(*2 * [np.linspace(-0.75, 0.75, 9)]))
 _BASIS = np.column_stack([np.ones(81), _U, _V, _U * _U, _U * _V, _V * _V])
 _BASIS = _BASIS[_U * _U + _V * _V <= 0.5625]
+_BY_TERM = np.ascontiguousarray(_BASIS.T)
+_PRODUCTS = np.array([_BY_TERM[p] * _BY_TERM[q] for p in range(6) for q in range(p, 6)])
 _RINGS = np.array([0.15, 0.3, 0.45, 0.6, 0.75, 0.88, 0.97])
 
 
@@ -134,45 +136,49 @@ def contrast_features(image: Plane, shape: Shape, row: Table) -> None:
 
 
 @jit
-def _quadric(z: Table, sigma: float, a: Table, b: Table) -> None:
+def _quadric(z: Table, sigma: float, before: Table, a: Table, weight: Table) -> float:
     """Fit z = b0 + b1 u + b2 v + b3 u^2 + b4 u v + b5 v^2 to heights z (P,) m, -1 for unknown.
 
-    On entry `b` is the previous solution, from which far points (beyond 3 sigma) are left out.
+    Args:
+        z: (P,)
+        sigma: m; points farther than 3 sigma from the previous solution are left out.
+        before: (6,) the previous solution; the new one is written over it.
+        a: (6, 6) scratch.
+        weight: (P,) scratch.
+
+    Returns:
+        The root mean square residual (m) of the points; each clipped to 20 mm.
     """
-    before = b.copy()
-    a[:] = 0
-    b[:] = 0
     for k in range(len(z)):
-        basis = _BASIS[k]
-        if z[k] == -1 or abs(_misfit(z[k], basis, before)) > 3 * sigma:
-            continue
-        for p in range(6):
-            b[p] += basis[p] * z[k]
-            for q in range(p, 6):
-                a[p, q] += basis[p] * basis[q]
-    for p in range(6):
+        weight[k] = 1.0 if (z[k] != -1) & (_misfit(z[k], k, before) <= 3 * sigma) else 0.0
+    row = 0
+    for p in range(6):  # products of the basis that are ready leave sums that SIMD does
+        total = 0.0
+        for k in range(len(z)):
+            total += weight[k] * z[k] * _BY_TERM[p, k]
+        before[p] = total
+        for q in range(p, 6):
+            total = 0.0
+            for k in range(len(z)):
+                total += weight[k] * _PRODUCTS[row, k]
+            a[p, q] = a[q, p] = total
+            row += 1
         a[p, p] += 1e-4
-        for q in range(p):
-            a[p, q] = a[q, p]
-    solve(a, b)
-
-
-@jit
-def _misfit(z: float, basis: Table, b: Table) -> float:
-    """Return by how much (m) a height lies over a quadric."""
-    surface = b[0] + b[1] * basis[1] + b[2] * basis[2]
-    return float(z - surface - b[3] * basis[3] - b[4] * basis[4] - b[5] * basis[5])
-
-
-@jit
-def _rms(z: Table, b: Table) -> float:
-    """Return the root mean square residual (m) of a quadric; each clipped to 20 mm."""
-    total, count = 0.0, 0
+    solve(a, before)
+    squares, count = 0.0, 0.0
     for k in range(len(z)):
-        if z[k] != -1:
-            total += min(abs(_misfit(z[k], _BASIS[k], b)), 0.02) ** 2
-            count += 1
-    return math.sqrt(total / max(count, 1))
+        known = 1.0 if z[k] != -1 else 0.0
+        squares += known * min(_misfit(z[k], k, before), 0.02) ** 2
+        count += known
+    return math.sqrt(squares / max(count, 1.0))
+
+
+@jit
+def _misfit(z: float, k: int, b: Table) -> float:
+    """Return how far (m) the height of the k-th point lies from a quadric."""
+    plane = b[0] + b[1] * _BY_TERM[1, k] + b[2] * _BY_TERM[2, k]
+    bend = b[3] * _BY_TERM[3, k] + b[4] * _BY_TERM[4, k] + b[5] * _BY_TERM[5, k]
+    return float(abs(z - plane - bend))
 
 
 @jit
@@ -196,15 +202,15 @@ def surface_features(height: Plane, shape: Shape, pixel: float, row: Table) -> f
     row[6] = 1 - known / len(z)
     if row[6] > 1 - LEAST_KNOWN or known < 8:
         return math.nan
-    a, b = np.empty((6, 6)), np.zeros(6)
-    _quadric(z, math.inf, a, b)
-    _quadric(z, max(0.001, _rms(z, b)), a, b)
+    a, b, weight = np.empty((6, 6)), np.zeros(6), np.empty(len(z))
+    rms = _quadric(z, math.inf, b, a, weight)
+    rms = _quadric(z, max(0.001, rms), b, a, weight)
     radius = shape[2] * pixel
     mean, spread = -(b[3] + b[5]), math.sqrt((b[3] - b[5]) ** 2 + b[4] ** 2)
     row[0] = b[0] / (abs(b[0]) + radius)
     row[1] = min(3.0, max(-2.0, (mean - spread) / radius))
     row[2] = min(4.0, max(-2.0, (mean + spread) / radius))
-    row[3] = min(1.0, _rms(z, b) / radius)
+    row[3] = min(1.0, rms / radius)
     return float(b[0])
 
 
@@ -215,11 +221,10 @@ def edge_features(height: Plane, shape: Shape, pixel: float, hits: Rows, row: Ta
     n, known, lower, higher = 0, 0, 0, 0
     while n < len(hits) and hits[n] != -2:
         n += 1
-    cosine, sine = math.cos(2 * math.pi / max(n, 1)), math.sin(2 * math.pi / max(n, 1))
-    c, s = cosine, -sine
+    ups = np.empty((2, n), np.float32)
+    rises(height, shape, COSINES[n, :n], SINES[n, :n], ups)
     for k in range(n):
-        c, s = turned(c, s, cosine, sine)
-        up = rise(height, shape[0], shape[1], c, s, shape[2])
+        up = ups[0, k]
         if up == 0:
             continue
         known += 1

@@ -15,7 +15,6 @@ from mushpipe.core.stage import GraphPath
 from mushpipe.stages.phase_decide import decide, polish
 from mushpipe.stages.phase_depth import NO_RELIEF, Relief, relief_of
 from mushpipe.stages.phase_edges import (
-    Edges,
     Gradient,
     Plane,
     Rows,
@@ -27,7 +26,7 @@ from mushpipe.stages.phase_features import LEARNED, NAMES, kinds, static_feature
 from mushpipe.stages.phase_fuse import fused
 from mushpipe.stages.phase_learned import add_discs, agreement, candidates_of
 from mushpipe.stages.phase_refit import Table, refit
-from mushpipe.stages.phase_strips import in_strips
+from mushpipe.stages.phase_strips import Strips, in_strips
 from mushpipe.stages.phase_votes import CELL, peaks, rings_between, summed, vote
 from mushpipe.stages.verifier import load_verifier
 
@@ -55,7 +54,7 @@ class Evidence:
         pixel: Size of a pixel on the bed, m.
     """
 
-    edges: Edges
+    edges: Strips
     shapes: Table
     hits: Rows
     table: Table
@@ -195,10 +194,12 @@ class PhaseHough(Stage):
 
     def _edges(
         self, image: Plane, gradient: Gradient, region: Bytes, relief: Relief | None
-    ) -> Edges:
+    ) -> Strips:
         otsu = max(otsu_of(gradient.size, _TOP), _FLOOR)
-        edges = edges_of(image, gradient, region, self.edge * otsu, 1.2 * otsu)
-        return in_strips(fused(edges, relief.edges(), CELL) if relief else edges)
+        edges, pixels = edges_of(image, gradient, region, self.edge * otsu, 1.2 * otsu)
+        if relief:
+            edges = fused(edges, pixels, relief.edges(), CELL)
+        return in_strips(edges, *image.shape)
 
     def _plausible(self, shapes: Table, middle: Table, relief: Relief | None) -> NDArray[np.bool_]:
         """Return which candidates have a possible diameter in metres, or none that is known."""

@@ -15,12 +15,15 @@ from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
 from mushpipe.stages.linear import solve
-from mushpipe.stages.phase_edges import Edges, Plane, Rows, Shape, Singles
+from mushpipe.stages.phase_edges import Plane, Rows, Shape, Singles
 from mushpipe.stages.phase_steps import step_up
-from mushpipe.stages.phase_strips import TURNED, gather, outline_hits
+from mushpipe.stages.phase_strips import TURNED, Strips, gather, outline_hits
 
 Table = NDArray[np.float64]
 DIRECTIONS = 96
+# of each direction, by how many there are
+_TURNS = 2 * np.pi * np.arange(DIRECTIONS) / np.maximum(np.arange(DIRECTIONS + 1), 1)[:, None]
+COSINES, SINES = np.cos(_TURNS).astype(np.float32), np.sin(_TURNS).astype(np.float32)
 # A wide fit, then a narrow one to the edge points around what it found; both of the radius.
 REACH = (0.3, 0.2)  # how far from the outline edge points are looked for
 SCALES = ((0.18, 0.1), (0.08, 0.05))  # the residual at which a weight has fallen to a quarter
@@ -43,12 +46,6 @@ def directions_of(radius: float) -> int:
 
 
 @jit
-def turned(c: float, s: float, cosine: float, sine: float) -> tuple[float, float]:
-    """Return a direction turned by an angle; a recurrence is ten times as fast as cos and sin."""
-    return c * cosine - s * sine, s * cosine + c * sine
-
-
-@jit
 def tolerance(radius: float) -> float:
     """Return how far (px) from the outline an edge point still supports it."""
     return max(1.5, 0.07 * radius)
@@ -56,7 +53,7 @@ def tolerance(radius: float) -> float:
 
 @jit
 def _accumulate(
-    edges: Edges, rows: Rows, count: int, shape: Shape, scale: float, a: Table, b: Table
+    edges: Strips, rows: Rows, count: int, shape: Shape, scale: float, a: Table, b: Table
 ) -> float:
     """Write the normal equations of the edge points to a (5, 5), b (5,); return the weights' sum.
 
@@ -96,7 +93,7 @@ def _accumulate(
 
 
 @jit
-def fit_outline(edges: Edges, rows: Rows, count: int, shape: Shape, stage: int) -> bool:
+def fit_outline(edges: Strips, rows: Rows, count: int, shape: Shape, stage: int) -> bool:
     """Improve x, y, r, p, q (5,) in place; False where the points do not hold it in place."""
     start_x, start_y, start_r = shape[0], shape[1], shape[2]
     a, b = np.empty((5, 5)), np.empty(5)
@@ -123,7 +120,7 @@ def fit_outline(edges: Edges, rows: Rows, count: int, shape: Shape, stage: int) 
 
 @jit
 def around(
-    edges: Edges, height: Plane, pixel: float, shape: Shape, stage: int, scratch: Rows
+    edges: Strips, height: Plane, pixel: float, shape: Shape, stage: int, scratch: Rows
 ) -> int:
     """Write the rows of edge points around an outline into `scratch[0]`; return how many."""
     reach = max(3.0, REACH[stage] * shape[2])
@@ -133,7 +130,7 @@ def around(
 
 @jit
 def fit_around(
-    edges: Edges, height: Plane, pixel: float, shape: Shape, stage: int, scratch: Rows
+    edges: Strips, height: Plane, pixel: float, shape: Shape, stage: int, scratch: Rows
 ) -> bool:
     """Fit an outline (5,) to the edge points around it, in place; False if they do not hold it."""
     count = around(edges, height, pixel, shape, stage, scratch)
@@ -142,7 +139,7 @@ def fit_around(
 
 @jit
 def refit(
-    edges: Edges, height: Plane, pixel: float, candidates: Plane, smallest: float, largest: float
+    edges: Strips, height: Plane, pixel: float, candidates: Plane, smallest: float, largest: float
 ) -> tuple[Table, Rows, Singles]:
     """Refit candidates (N, 4) to the edges; those that nothing holds in place are dropped.
 
@@ -165,8 +162,7 @@ def refit(
     kept = tried = 0
     firm = np.zeros(len(candidates), np.bool_)
     wide, following = np.empty((n, 5)), np.empty((2, n), np.int32)
-    height_px, width_px = edges.pixels.shape
-    cells = np.full((2, height_px // BUCKET + 3, width_px // BUCKET + 3), -1, np.int32)
+    cells = np.full((2, edges.height // BUCKET + 3, edges.width // BUCKET + 3), -1, np.int32)
     for start in STARTS:
         for k in range(len(candidates)):
             if firm[k] or (start > 1 and candidates[k, 2] > 0.95 * largest):

@@ -7,12 +7,13 @@ range: SIMD looks at all of them in a fraction of the time that it takes to look
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from mushpipe.core.jit import jit
-from mushpipe.stages.phase_edges import Edges, Plane, Rows, Shape
-from mushpipe.stages.phase_steps import rise
+from mushpipe.stages.phase_edges import Edges, Plane, Rows, Shape, Singles
+from mushpipe.stages.phase_steps import rises
 
 STRIP = 16  # px
 AROUND = 32  # sectors of an outline in which it is looked for what hides it
@@ -20,7 +21,7 @@ AROUND = 32  # sectors of an outline in which it is looked for what hides it
 _SIDE = np.repeat([1, -1], AROUND // 2)
 _ACROSS = _SIDE * np.tile(1 - np.arange(1, AROUND, 2) * 2 / AROUND, 2)
 _ALONG = _SIDE * (1 - abs(_ACROSS))
-COSINE, SINE = np.array([_ACROSS, _ALONG]) / np.hypot(_ACROSS, _ALONG)
+COSINE, SINE = (np.array([_ACROSS, _ALONG]) / np.hypot(_ACROSS, _ALONG)).astype(np.float32)
 TURNED = 0.7  # cosine between an edge's normal and the radius
 ALIGNED = 0.8  # the same, for edges that support an outline
 RAY = np.float32(0.75)  # px; so far beside a direction an edge may lie
@@ -29,16 +30,36 @@ A7, A9 = np.float32(-0.0851330), np.float32(0.0208351)
 QUARTER, FULL = np.float32(math.pi / 2), np.float32(2 * math.pi)
 
 
-@jit
-def _sort(points: Plane, pixels: Rows) -> tuple[Plane, Rows]:
-    """Return points (C, M), x and y first, by strip and column, and where each column begins.
+class Strips(NamedTuple):
+    """Edge points by strip and column.
 
-    Their new rows are written into the index of pixels (H, W).
+    Attributes:
+        x: (M,) px, as all up to `weight` in `Edges`.
+        y: (M,) px.
+        nx: (M,)
+        ny: (M,)
+        weight: (M,)
+        starts: Where each column of each strip begins.
+        height: Of the image, px.
+        width: Of the image, px.
     """
-    height, width = pixels.shape
+
+    x: Singles
+    y: Singles
+    nx: Singles
+    ny: Singles
+    weight: Singles
+    starts: Rows
+    height: int
+    width: int
+
+
+@jit
+def _sort(points: Plane, height: int, width: int) -> tuple[Plane, Rows]:
+    """Return points (C, M), x and y first, by strip and column, and where each column begins."""
     count = points.shape[1]
     starts = np.zeros((height // STRIP + 1) * width + 1, np.int32)
-    cell, new = np.empty(count, np.int32), np.empty(count, np.int32)
+    cell, row = np.empty(count, np.int32), np.empty(count, np.int32)
     for k in range(count):
         u = min(max(int(points[0, k]), 0), width - 1)
         cell[k] = min(max(int(points[1, k]), 0), height - 1) // STRIP * width + u
@@ -47,23 +68,18 @@ def _sort(points: Plane, pixels: Rows) -> tuple[Plane, Rows]:
         starts[k] += starts[k - 1]
     free, out = starts.copy(), np.empty_like(points)
     for k in range(count):
-        new[k] = free[cell[k]]
+        row[k] = free[cell[k]]
         free[cell[k]] += 1
     for column in range(len(points)):
         for k in range(count):
-            out[column, new[k]] = points[column, k]
-    for v in range(height):
-        for u in range(width):
-            if pixels[v, u] >= 0:
-                pixels[v, u] = new[pixels[v, u]]
+            out[column, row[k]] = points[column, k]
     return out, starts
 
 
-def in_strips(edges: Edges) -> Edges:
-    """Return edge points in the order of their strips; `pixels` is rewritten in place."""
-    points, starts = _sort(np.stack(edges[:5]), edges.pixels)
-    x, y, nx, ny, weight = points
-    return Edges(x, y, nx, ny, weight, edges.pixels, starts)
+def in_strips(edges: Edges, height: int, width: int) -> Strips:
+    """Return the edge points of an image of a size (px) in strips."""
+    (x, y, nx, ny, weight), starts = _sort(np.stack(edges), height, width)
+    return Strips(x, y, nx, ny, weight, starts, height, width)
 
 
 @jit
@@ -76,35 +92,31 @@ def _sector(dx: float, dy: float) -> int:
 
 @jit
 def _uncovered(
-    edges: Edges, height: Plane, step: float, shape: Shape, rows: Rows, count: int
+    edges: Strips, height: Plane, step: float, shape: Shape, rows: Rows, count: int
 ) -> int:
     """Keep the rows of points in whose sector nothing stands higher; return their number."""
-    hidden, some = np.empty(AROUND, np.int32), 0
-    for k in range(AROUND):
-        up = rise(height, shape[0], shape[1], COSINE[k], SINE[k], shape[2])
-        hidden[k] = up > step
-        some += hidden[k]
-    if some == 0:
+    up, kept = np.empty((2, AROUND), np.float32), 0
+    rises(height, shape, COSINE, SINE, up)
+    if up[0].max() <= step:
         return count
-    kept = 0
     for k in range(count):
         row = rows[k]
         rows[kept] = row
-        kept += 1 - hidden[_sector(edges.x[row] - shape[0], edges.y[row] - shape[1])]
+        kept += up[0, _sector(edges.x[row] - shape[0], edges.y[row] - shape[1])] <= step
     return kept
 
 
 @jit
-def _strips(edges: Edges, shape: Shape, outer: float) -> tuple[int, int]:
+def _strips(edges: Strips, shape: Shape, outer: float) -> tuple[int, int]:
     """Return the strips, from and up to, that a circle around an outline's centre crosses."""
-    last = min(edges.pixels.shape[0] - 1, int(shape[1] + outer))
+    last = min(edges.height - 1, int(shape[1] + outer))
     return max(0, int(shape[1] - outer)) // STRIP, last // STRIP + 1
 
 
 @jit
-def _span(edges: Edges, shape: Shape, outer: float, strip: int) -> tuple[int, int]:
+def _span(edges: Strips, shape: Shape, outer: float, strip: int) -> tuple[int, int]:
     """Return the rows, from and up to, of the points of a strip that may lie in such a circle."""
-    width = edges.pixels.shape[1]
+    width = edges.width
     away = max(strip * STRIP - shape[1], shape[1] - (strip + 1) * STRIP, 0.0)
     half = math.sqrt(max(0.0, outer * outer - away * away))
     left = min(max(0, int(shape[0] - half)), width)
@@ -113,7 +125,7 @@ def _span(edges: Edges, shape: Shape, outer: float, strip: int) -> tuple[int, in
 
 
 @jit
-def _around(edges: Edges, low: int, shape: Shape, reach: float, near: Rows) -> None:
+def _around(edges: Strips, low: int, shape: Shape, reach: float, near: Rows) -> None:
     """Write whether the points from a row on lie within `reach` of an outline and face its centre.
 
     In single precision and without branches, so that SIMD does it.
@@ -134,7 +146,7 @@ def _around(edges: Edges, low: int, shape: Shape, reach: float, near: Rows) -> N
 
 @jit
 def gather(
-    edges: Edges, height: Plane, step: float, shape: Shape, reach: float, scratch: Rows
+    edges: Strips, height: Plane, step: float, shape: Shape, reach: float, scratch: Rows
 ) -> int:
     """Write which edge points around an outline face its centre into `scratch[0]`; return how many.
 
@@ -177,7 +189,9 @@ def _turn(dx: np.float32, dy: np.float32) -> np.float32:
 
 
 @jit
-def _beside(edges: Edges, low: int, shape: Shape, near: float, n: int, at: Rows, off: Rows) -> None:
+def _beside(
+    edges: Strips, low: int, shape: Shape, near: float, n: int, at: Rows, off: Rows
+) -> None:
     """Write at which of n directions the points from a row on support an outline, -1 for none.
 
     Args:
@@ -210,7 +224,7 @@ def _beside(edges: Edges, low: int, shape: Shape, near: float, n: int, at: Rows,
 
 @jit
 def outline_hits(
-    edges: Edges, shape: Shape, near: float, n: int, hits: Rows, scratch: Rows
+    edges: Strips, shape: Shape, near: float, n: int, hits: Rows, scratch: Rows
 ) -> tuple[int, float]:
     """Write per direction the row of the nearest edge point that supports the outline, else -1.
 

@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
-from mushpipe.stages.phase_edges import Edges, Plane, Singles
+from mushpipe.stages.phase_edges import Plane, Singles
+from mushpipe.stages.phase_strips import Strips
 
 CELL = 2  # px; the accumulator has half the resolution of the image
 GAP = 0.15
@@ -61,24 +62,24 @@ def phase_of(radius: NDArray[np.float64], smallest: float, largest: float) -> ND
 
 
 @jit
-def vote(edges: Edges, rings: Rings, shape: tuple[int, int]) -> NDArray[np.float32]:
+def vote(edges: Strips, rings: Rings, shape: tuple[int, int]) -> NDArray[np.float32]:
     """Return the accumulator (h, w, 2), real and imaginary part per cell."""
-    height, width = shape
-    cells = np.zeros((height, width, 2), np.float32)
+    height, width = np.int32(shape[0]), np.int32(shape[1])
+    cells, at = np.zeros(2 * height * width, np.float32), np.empty(len(rings.radius), np.int32)
     half = np.float32(1 / CELL)
     for k in range(len(edges.x)):
         x, y = (edges.x[k] + np.float32(0.5)) * half, (edges.y[k] + np.float32(0.5)) * half
         dx, dy, weight = edges.nx[k] * half, edges.ny[k] * half, edges.weight[k]
-        for j in range(len(rings.radius)):
-            u = x + rings.radius[j] * dx
-            v = y + rings.radius[j] * dy
-            if u < 0 or v < 0:
-                continue
-            column, row = int(u), int(v)
-            if column < width and row < height:
-                cells[row, column, 0] += weight * rings.real[j]
-                cells[row, column, 1] += weight * rings.imaginary[j]
-    return cells
+        for j in range(len(at)):  # all cells of a ray first, which SIMD does
+            u, v = x + rings.radius[j] * dx, y + rings.radius[j] * dy
+            inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+            at[j] = 2 * (np.int32(v) * width + np.int32(u)) if inside else -1
+        for j in range(len(at)):
+            if at[j] >= 0:
+                cell = np.uint32(at[j])
+                cells[cell] += weight * rings.real[j]
+                cells[cell + np.uint32(1)] += weight * rings.imaginary[j]
+    return cells.reshape((shape[0], shape[1], 2))
 
 
 @jit

@@ -11,7 +11,7 @@ from mushpipe import Mask
 from mushpipe.stages.bed import far_cells, fit_plane, plane_depth
 from mushpipe.stages.phase_decide import lens, outline_features, overlap_features, probability
 from mushpipe.stages.phase_depth import GRID, closed, halved, relief_of
-from mushpipe.stages.phase_edges import Edges, edges_of, gradient_of, otsu_of
+from mushpipe.stages.phase_edges import edges_of, gradient_of, otsu_of
 from mushpipe.stages.phase_features import (
     DEPTH_FEATURES,
     IMAGE_FEATURES,
@@ -21,6 +21,7 @@ from mushpipe.stages.phase_features import (
 )
 from mushpipe.stages.phase_hough import PhaseHough, equal_area_radius
 from mushpipe.stages.phase_refit import DIRECTIONS, HIDDEN, directions_of
+from mushpipe.stages.phase_strips import Strips, in_strips
 from mushpipe.stages.phase_votes import GAP, peaks, phase_of, rings_between, summed, vote
 from mushpipe.stages.verifier import Verifier, load_verifier, weights_of
 from tests.stages.scenes import discs, frame_of, sphere_depth
@@ -33,9 +34,9 @@ def gray_of(image: np.ndarray) -> np.ndarray:
     return (image * 255).astype(np.float32)
 
 
-def edges(image: np.ndarray, threshold: float = 5.0) -> Edges:
+def edges(image: np.ndarray, threshold: float = 5.0) -> Strips:
     gray = gray_of(image)
-    return edges_of(gray, gradient_of(gray), ALL, threshold, threshold)
+    return in_strips(edges_of(gray, gradient_of(gray), ALL, threshold, threshold)[0], *image.shape)
 
 
 def static_row(
