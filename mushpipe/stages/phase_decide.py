@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
-from mushpipe.stages.phase_edges import Plane, Rows, Shape
+from mushpipe.stages.phase_edges import Plane, Rows, Shape, Singles
 from mushpipe.stages.phase_refit import (
     COSINES,
     HIDDEN,
@@ -76,6 +76,16 @@ def _covered(x: float, y: float, accepted: Table, margin: float) -> bool:
 
 
 @jit
+def _cover(x: Singles, y: Singles, other: Shape, under: Rows) -> None:
+    """Mark the points that lie within a circle by more than `MARGIN`."""
+    u, v = np.float32(other[0]), np.float32(other[1])
+    square = np.float32(max(0.0, other[2] - MARGIN) ** 2)
+    for k in range(len(x)):
+        dx, dy = x[k] - u, y[k] - v
+        under[k] |= dx * dx + dy * dy < square
+
+
+@jit
 def outline_features(
     edges: Strips, shape: Shape, hits: Rows, owner: Rows, accepted: Table, row: Table
 ) -> None:
@@ -87,9 +97,15 @@ def outline_features(
     n, inside, free, found, weight = 0, 0, 0, 0, 0.0
     while n < len(hits) and hits[n] != -2:
         n += 1
+    x, y, under = np.empty(n, np.float32), np.empty(n, np.float32), np.zeros(n, np.int32)
     for k in range(n):
-        x, y = shape[0] + shape[2] * COSINES[n, k], shape[1] + shape[2] * SINES[n, k]
-        if x < 0 or y < 0 or x > edges.width - 1 or y > edges.height - 1:
+        x[k] = shape[0] + shape[2] * COSINES[n, k]
+        y[k] = shape[1] + shape[2] * SINES[n, k]
+    for other in accepted:
+        _cover(x, y, other, under)
+    right, bottom = edges.width - 1, edges.height - 1
+    for k in range(n):
+        if x[k] < 0 or y[k] < 0 or x[k] > right or y[k] > bottom:
             continue
         inside += 1
         if hits[k] == HIDDEN:
@@ -98,7 +114,7 @@ def outline_features(
             free += 1
             found += 1
             weight += edges.weight[hits[k]]
-        elif not _covered(x, y, accepted, MARGIN):
+        elif under[k] == 0:
             free += 1
     row[0] = free / max(inside, 1)
     row[1] = found / max(free, 1)

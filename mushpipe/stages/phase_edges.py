@@ -134,21 +134,29 @@ def _at(plane: Plane, x: float, y: float) -> float:
 
 
 @jit
-def _near(plane: Plane, x: float, y: float) -> float:
-    """Value of the nearest pixel of the image."""
-    u = min(max(int(x + 0.5), 0), plane.shape[1] - 1)
-    return float(plane[min(max(int(y + 0.5), 0), plane.shape[0] - 1), u])
+def _looked_up(
+    image: Plane, x: Singles, y: Singles, nx: Singles, ny: Singles, t: float, out: Singles
+) -> None:
+    """Write the values of the pixels at a distance from points along their normals."""
+    height, width = np.int32(image.shape[0] - 1), np.int32(image.shape[1] - 1)
+    flat, far, half = image.reshape(-1), np.float32(t), np.float32(0.5)
+    for k in range(len(x)):  # without branches, for SIMD
+        u = min(max(np.int32(x[k] + far * nx[k] + half), np.int32(0)), width)
+        v = min(max(np.int32(y[k] + far * ny[k] + half), np.int32(0)), height)
+        out[k] = flat[np.uint32(v * (width + np.int32(1)) + u)]
 
 
 @jit
-def _beyond_over_before(image: Plane, x: int, y: int, nx: float, ny: float) -> float:
-    """Return how bright it is beyond an edge, which the normal points away from, over before it."""
-    inside = _near(image, x + 3 * nx, y + 3 * ny)
-    outside = min(
-        _near(image, x - 2.5 * nx, y - 2.5 * ny),
-        _near(image, x - 3.5 * nx, y - 3.5 * ny),
-    )
-    return max(outside, 0.0) / max(inside, 1e-3)
+def beyond_over_before(image: Plane, x: Singles, y: Singles, nx: Singles, ny: Singles) -> Singles:
+    """Return how bright it is beyond edges, which the normals point away from, over before them."""
+    inside, near, far = np.empty((3, len(x)), np.float32)
+    _looked_up(image, x, y, nx, ny, 3.0, inside)
+    _looked_up(image, x, y, nx, ny, -2.5, near)
+    _looked_up(image, x, y, nx, ny, -3.5, far)
+    nothing, least = np.float32(0), np.float32(1e-3)
+    for k in range(len(x)):
+        near[k] = max(min(near[k], far[k]), nothing) / max(inside[k], least)
+    return near
 
 
 @jit
@@ -187,7 +195,6 @@ def _ridge(
 
 @jit
 def thin(
-    image: Plane,
     gx: Plane,
     gy: Plane,
     size: Plane,
@@ -202,14 +209,12 @@ def thin(
     before, at, and behind the pixel. `index` receives the row at each pixel.
 
     Args:
-        image: (H, W)
-        gx: (H, W) its gradient.
+        gx: (H, W) the gradient of an image.
         gy: (H, W)
-        size: (H, W) magnitude of the gradient.
+        size: (H, W) its magnitude.
         region: (H, W) where to look.
         threshold: Least magnitude.
-        points: (capacity, 6) receives x, y, nx, ny, magnitude over threshold, and how bright it is
-            beyond the edge, over before it.
+        points: (7, capacity) receives x, y, nx, ny, magnitude over threshold, and the pixel.
         index: (H, W)
 
     Returns:
@@ -230,12 +235,11 @@ def thin(
                 continue
             bend = ahead - 2 * m + behind
             t = 0.5 * (behind - ahead) / bend if bend < -1e-6 else 0.0
-            if count == len(points):
+            if count == points.shape[1]:
                 return count
-            points[count, 0], points[count, 1] = x + t * nx, y + t * ny
-            points[count, 2], points[count, 3] = nx, ny
-            points[count, 4] = m / threshold
-            points[count, 5] = _beyond_over_before(image, x, y, nx, ny)
+            points[0, count], points[1, count] = x + t * nx, y + t * ny
+            points[2, count], points[3, count] = nx, ny
+            points[4, count], points[5, count], points[6, count] = m / threshold, x, y
             index[y, x] = count
             count += 1
     return count
@@ -256,7 +260,8 @@ def edges_of(
     Returns:
         The edges, and (H, W) the row of the edge that was found at a pixel, -1 for none.
     """
-    x, y, nx, ny, strength, bright, index = _thin_edges(image, grad, region, threshold)
+    (x, y, nx, ny, strength, column, row), index = _thin_edges(grad, region, threshold)
+    bright = beyond_over_before(image, column, row, nx, ny)
     share = np.clip((bright - DIM) / (BRIGHT - DIM), 0, 1).astype(np.float32)
     weight = np.minimum(1, strength * np.float32(threshold / full))
     weight *= 1 - (1 - np.float32(BRIGHT_TRUST)) * share
@@ -267,15 +272,12 @@ def edges_of(
 def depth_edges(height: Plane, threshold: float) -> Edges:
     """Return the thin edges of a height map (H, W), all of the same weight."""
     region = np.ones(height.shape, np.uint8)
-    x, y, nx, ny, _, _, _ = _thin_edges(height, gradient_of(height), region, threshold)
-    return Edges(x, y, nx, ny, np.full(len(x), DEPTH_ALONE, np.float32))
+    (x, y, nx, ny, strength, _, _), _ = _thin_edges(gradient_of(height), region, threshold)
+    return Edges(x, y, nx, ny, np.full_like(strength, DEPTH_ALONE))
 
 
-def _thin_edges(
-    image: Plane, grad: Gradient, region: NDArray[np.uint8], threshold: float
-) -> tuple[Singles, Singles, Singles, Singles, Singles, Singles, Rows]:
-    index = np.full(image.shape, -1, np.int32)
-    points = np.empty((image.size // 6 + 16, 6), np.float32)
-    count = thin(image, *grad, region, threshold, points, index)
-    x, y, nx, ny, strength, bright = np.ascontiguousarray(points[:count].T)
-    return x, y, nx, ny, strength, bright, index
+def _thin_edges(grad: Gradient, region: NDArray[np.uint8], threshold: float) -> tuple[Plane, Rows]:
+    index = np.full(grad.size.shape, -1, np.int32)
+    points = np.empty((7, grad.size.size // 6 + 16), np.float32)
+    count = thin(*grad, region, threshold, points, index)
+    return points[:, :count], index
