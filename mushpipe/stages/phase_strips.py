@@ -108,20 +108,26 @@ def _uncovered(
 
 @jit
 def _strips(edges: Strips, shape: Shape, outer: float) -> tuple[int, int]:
-    """Return the strips, from and up to, that a circle around an outline's centre crosses."""
-    last = min(edges.height - 1, int(shape[1] + outer))
-    return max(0, int(shape[1] - outer)) // STRIP, last // STRIP + 1
+    """Return the strips, from and up to, that a circle around an outline's centre crosses.
+
+    Points beyond the image are in the strips and columns at its border, and so is such a circle.
+    """
+    first = min(max(int(shape[1] - outer), 0), edges.height - 1)
+    last = min(max(int(shape[1] + outer), 0), edges.height - 1)
+    return first // STRIP, last // STRIP + 1
 
 
 @jit
 def _span(edges: Strips, shape: Shape, outer: float, strip: int) -> tuple[int, int]:
     """Return the rows, from and up to, of the points of a strip that may lie in such a circle."""
-    width = edges.width
-    away = max(strip * STRIP - shape[1], shape[1] - (strip + 1) * STRIP, 0.0)
+    above = strip * STRIP - shape[1] if strip > 0 else 0.0
+    below = shape[1] - (strip + 1) * STRIP if (strip + 1) * STRIP < edges.height else 0.0
+    away = max(above, below, 0.0)
     half = math.sqrt(max(0.0, outer * outer - away * away))
-    left = min(max(0, int(shape[0] - half)), width)
-    right = max(min(width - 1, int(shape[0] + half)), left - 1)
-    return edges.starts[strip * width + left], edges.starts[strip * width + right + 1]
+    left = min(max(int(shape[0] - half), 0), edges.width - 1)
+    right = min(max(int(shape[0] + half), 0), edges.width - 1)
+    row = strip * edges.width
+    return edges.starts[row + left], edges.starts[row + right + 1]
 
 
 @jit
@@ -211,10 +217,12 @@ def _beside(
     for i in range(len(at)):
         k = np.uint32(low + i)
         dx, dy = edges.x[k] - x, edges.y[k] - y
-        square = max(dx * dx + dy * dy, one)
+        square = dx * dx + dy * dy
+        safe = max(square, one)
         away = dx * edges.nx[k] + dy * edges.ny[k]
-        e = abs(np.sqrt(square) - r - (p * (dx * dx - dy * dy) + q * dx * dy) / square)
-        supports = (away < 0) & (away * away >= cosine * square) & (e < far)
+        e = abs(np.sqrt(safe) - r - (p * (dx * dx - dy * dy) + q * dx * dy) / safe)
+        facing = (away < 0) & (away * away >= cosine * square)
+        supports = facing & (e < far) & (square >= one)
         turn = _turn(dx, dy) * per_turn + half
         place = np.int32(turn)
         beside = abs(turn - np.float32(place) - half) * gap < RAY

@@ -65,6 +65,16 @@ def test_all_points_around_an_outline_are_found(
     assert len(set(found)) == len(found)
 
 
+@pytest.mark.parametrize("place", [(-20.0, 60.0), (80.0, -20.0), (180.0, 60.0), (80.0, 140.0)])
+def test_points_beyond_the_image_are_found_from_beyond_it(place: tuple[float, float]) -> None:
+    edges, outline = in_strips(scattered(3), 120, 160), np.array([*place, 20.0, 0.0, 0.0])
+    scratch = np.empty((2, len(edges.x)), np.int32)
+    found = scratch[0, : gather(edges, NOTHING, 0.0, outline, 4.0, scratch)]
+    _, off, facing = seen_from(edges, outline)
+    assert set(found) == set(np.flatnonzero((off < 4) & (facing > TURNED)))
+    assert len(found) > 0
+
+
 def test_none_where_something_higher_hides_the_outline() -> None:
     edges, outline = in_strips(scattered(2), 120, 160), np.array([80.0, 60.0, 30.0, 0.0, 0.0])
     height = np.zeros((60, 80), np.float32)
