@@ -67,22 +67,16 @@ def overlap_features(shape: Shape, accepted: Table, row: Table) -> None:
 
 
 @jit
-def _covered(x: float, y: float, accepted: Table, margin: float) -> bool:
-    """Whether a point lies within a circle by more than a margin (px)."""
-    for other in accepted:
-        if (x - other[0]) ** 2 + (y - other[1]) ** 2 < max(0.0, other[2] - margin) ** 2:
-            return True
-    return False
-
-
-@jit
-def _cover(x: Singles, y: Singles, other: Shape, under: Rows) -> None:
-    """Mark the points that lie within a circle by more than `MARGIN`."""
-    u, v = np.float32(other[0]), np.float32(other[1])
-    square = np.float32(max(0.0, other[2] - MARGIN) ** 2)
-    for k in range(len(x)):
-        dx, dy = x[k] - u, y[k] - v
-        under[k] |= dx * dx + dy * dy < square
+def _covered(x: Singles, y: Singles, circles: Table, margin: float) -> Rows:
+    """Return 1 for points (N,) that lie within one of the circles by more than a margin (px)."""
+    under = np.zeros(len(x), np.int32)
+    for circle in circles:
+        u, v = np.float32(circle[0]), np.float32(circle[1])
+        square = np.float32(max(0.0, circle[2] - margin) ** 2)
+        for k in range(len(x)):
+            dx, dy = x[k] - u, y[k] - v
+            under[k] |= dx * dx + dy * dy < square
+    return under
 
 
 @jit
@@ -97,12 +91,11 @@ def outline_features(
     n, inside, free, found, weight = 0, 0, 0, 0, 0.0
     while n < len(hits) and hits[n] != -2:
         n += 1
-    x, y, under = np.empty(n, np.float32), np.empty(n, np.float32), np.zeros(n, np.int32)
+    x, y = np.empty((2, n), np.float32)
     for k in range(n):
         x[k] = shape[0] + shape[2] * COSINES[n, k]
         y[k] = shape[1] + shape[2] * SINES[n, k]
-    for other in accepted:
-        _cover(x, y, other, under)
+    under = _covered(x, y, accepted, MARGIN)
     right, bottom = edges.width - 1, edges.height - 1
     for k in range(n):
         if x[k] < 0 or y[k] < 0 or x[k] > right or y[k] > bottom:
@@ -282,18 +275,17 @@ def polish(edges: Strips, height: Plane, pixel: float, outlines: Table, owner: R
     before: where a cap dips under another one, its steepest shading is not its outline.
     """
     scratch = np.empty((2, len(edges.x)), np.int32)
-    rows, own = scratch  # what is looked at no more takes what is its own
+    own = scratch[0]
     shape = np.empty(5)
     for k in range(len(outlines)):
         shape[:] = outlines[k]
         near = _met(shape, outlines[:k])
         count = around(edges, height, pixel, shape, NARROW, scratch)
+        shaded = _covered(edges.x[own[:count]], edges.y[own[:count]], near, -SHADE)
         kept = 0
         for m in range(count):
-            row = rows[m]
-            if owner[row] >= 0 and owner[row] != k:
-                continue
-            if not _covered(edges.x[row], edges.y[row], near, -SHADE):
+            row = own[m]
+            if (owner[row] < 0 or owner[row] == k) and shaded[m] == 0:
                 own[kept] = row
                 kept += 1
         moved = fit_outline(edges, own, kept, shape, NARROW) if kept >= OWN else False

@@ -147,7 +147,7 @@ def _looked_up(
 
 
 @jit
-def beyond_over_before(image: Plane, x: Singles, y: Singles, nx: Singles, ny: Singles) -> Singles:
+def _beyond_over_before(image: Plane, x: Singles, y: Singles, nx: Singles, ny: Singles) -> Singles:
     """Return how bright it is beyond edges, which the normals point away from, over before them."""
     inside, near, far = np.empty((3, len(x)), np.float32)
     _looked_up(image, x, y, nx, ny, 3.0, inside)
@@ -261,7 +261,7 @@ def edges_of(
         The edges, and (H, W) the row of the edge that was found at a pixel, -1 for none.
     """
     (x, y, nx, ny, strength, column, row), index = _thin_edges(grad, region, threshold)
-    bright = beyond_over_before(image, column, row, nx, ny)
+    bright = _beyond_over_before(image, column, row, nx, ny)
     share = np.clip((bright - DIM) / (BRIGHT - DIM), 0, 1).astype(np.float32)
     weight = np.minimum(1, strength * np.float32(threshold / full))
     weight *= 1 - (1 - np.float32(BRIGHT_TRUST)) * share

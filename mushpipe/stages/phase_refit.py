@@ -21,7 +21,7 @@ from mushpipe.stages.phase_strips import TURNED, Strips, gather, outline_hits
 
 Table = NDArray[np.float64]
 DIRECTIONS = 96
-# of each direction, by how many there are
+# Cosine and sine of each direction, by how many directions there are.
 _TURNS = 2 * np.pi * np.arange(DIRECTIONS) / np.maximum(np.arange(DIRECTIONS + 1), 1)[:, None]
 COSINES, SINES = np.cos(_TURNS).astype(np.float32), np.sin(_TURNS).astype(np.float32)
 # A wide fit, then a narrow one to the edge points around what it found; both of the radius.

@@ -11,10 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mushpipe.core.jit import jit
+from mushpipe.core.jit import inlined, jit
 from mushpipe.stages.phase_edges import Edges, Plane, Rows, Shape, Singles
 from mushpipe.stages.phase_steps import rises
 
+Single = np.float32
 STRIP = 16  # px
 AROUND = 32  # sectors of an outline in which it is looked for what hides it
 # They are as wide as each other in |cos| + |sin| = 1, where a point's sector needs no arc tangent.
@@ -131,23 +132,40 @@ def _span(edges: Strips, shape: Shape, outer: float, strip: int) -> tuple[int, i
 
 
 @jit
-def _around(edges: Strips, low: int, shape: Shape, reach: float, near: Rows) -> None:
-    """Write whether the points from a row on lie within `reach` of an outline and face its centre.
-
-    In single precision and without branches, so that SIMD does it.
-    """
+def _single(shape: Shape) -> tuple[Single, Single, Single, Single, Single]:
+    """Return an outline in single precision, in which SIMD does twice as much."""
     x, y, r = np.float32(shape[0]), np.float32(shape[1]), np.float32(shape[2])
-    p, q = np.float32(shape[3]), np.float32(2 * shape[4])
-    one, cosine, far = np.float32(1), np.float32(TURNED**2), np.float32(reach)
+    return x, y, r, np.float32(shape[3]), np.float32(shape[4])
+
+
+@inlined
+def _seen(
+    edges: Strips,
+    k: np.uint32,
+    outline: tuple[Single, Single, Single, Single, Single],
+    square: Single,
+) -> tuple[Single, Single, Single, bool]:
+    """Return a point's place from the centre, its distance from the outline, and if it faces it.
+
+    `square` is that of the least cosine between its normal and the radius. Without branches.
+    """
+    x, y, r, p, q = outline
+    one, two = np.float32(1), np.float32(2)
+    dx, dy = edges.x[k] - x, edges.y[k] - y
+    squared = dx * dx + dy * dy
+    safe = max(squared, one)
+    away = dx * edges.nx[k] + dy * edges.ny[k]
+    e = abs(np.sqrt(safe) - r - (p * (dx * dx - dy * dy) + two * q * dx * dy) / safe)
+    return dx, dy, e, (away < 0) & (away * away >= square * squared) & (squared >= one)
+
+
+@jit
+def _around(edges: Strips, low: int, shape: Shape, reach: float, near: Rows) -> None:
+    """Write if the points from a row on lie within `reach` of an outline and face its centre."""
+    outline, square, far = _single(shape), np.float32(TURNED**2), np.float32(reach)
     for i in range(len(near)):
-        k = np.uint32(low + i)
-        dx, dy = edges.x[k] - x, edges.y[k] - y
-        square = dx * dx + dy * dy
-        safe = max(square, one)
-        away = dx * edges.nx[k] + dy * edges.ny[k]
-        e = np.sqrt(safe) - r - (p * (dx * dx - dy * dy) + q * dx * dy) / safe
-        facing = (away < 0) & (away * away >= cosine * square)
-        near[i] = facing & (abs(e) <= far) & (square >= one)
+        _, _, e, facing = _seen(edges, np.uint32(low + i), outline, square)
+        near[i] = facing & (e <= far)
 
 
 @jit
@@ -180,10 +198,10 @@ def gather(
 
 
 @jit
-def _turn(dx: np.float32, dy: np.float32) -> np.float32:
+def _turn(dx: Single, dy: Single) -> Single:
     """Return the angle (0..2 pi) of a direction, to 1e-5.
 
-    Abramowitz & Stegun (1964), 4.4.49; without branches, so that SIMD does it.
+    Abramowitz & Stegun (1964), 4.4.47; without branches, so that SIMD does it.
     """
     across, along = abs(dx), abs(dy)
     t = min(across, along) / max(across, along)
@@ -209,24 +227,15 @@ def _beside(
         at: (K,) receives the directions.
         off: (K,) receives the distances from the outline, in 1/1000 px.
     """
-    x, y, r = np.float32(shape[0]), np.float32(shape[1]), np.float32(shape[2])
-    p, q = np.float32(shape[3]), np.float32(2 * shape[4])
-    one, cosine, far = np.float32(1), np.float32(ALIGNED**2), np.float32(near)
+    outline, square, far = _single(shape), np.float32(ALIGNED**2), np.float32(near)
     gap = np.float32(2 * math.pi * shape[2] / n)
     per_turn, half, fine = np.float32(n / (2 * math.pi)), np.float32(0.5), np.float32(1000)
     for i in range(len(at)):
-        k = np.uint32(low + i)
-        dx, dy = edges.x[k] - x, edges.y[k] - y
-        square = dx * dx + dy * dy
-        safe = max(square, one)
-        away = dx * edges.nx[k] + dy * edges.ny[k]
-        e = abs(np.sqrt(safe) - r - (p * (dx * dx - dy * dy) + q * dx * dy) / safe)
-        facing = (away < 0) & (away * away >= cosine * square)
-        supports = facing & (e < far) & (square >= one)
+        dx, dy, e, facing = _seen(edges, np.uint32(low + i), outline, square)
         turn = _turn(dx, dy) * per_turn + half
         place = np.int32(turn)
         beside = abs(turn - np.float32(place) - half) * gap < RAY
-        at[i] = place if supports & beside else -1
+        at[i] = place if facing & (e < far) & beside else -1
         off[i] = np.int32(e * fine)
 
 

@@ -171,6 +171,7 @@ def test_live_and_every_kind_of_recording_of_a_scene_give_the_same_picks(tmp_pat
         apart = np.linalg.norm(ours.center[:, None] - ros.center, axis=-1)
         row, column = np.nonzero(apart < 0.5)
         assert np.median(apart[row, column]) < 0.01
+        assert (apart[row, column] < 0.1).mean() > 0.9
         assert len(set(row)) == len(set(column)) == len(row) > 0.9 * len(ours)
         for table, matched in ((ours, row), (ros, column)):
             assert (np.delete(table.score, matched) < UNSURE).all()
