@@ -18,6 +18,7 @@ from mushpipe.stages.cap_model import (
     UNKNOWNS,
     Floats,
     N,
+    Single,
     Singles,
     Vector,
     frozen,
@@ -145,15 +146,19 @@ def locate(cap: Floats, ray: Vector, covariance: Floats, sigma: float, out: Floa
         sigma: Of the ray's direction, rad.
         out: (6,) out.
     """
-    c = frozen(cap)
-    t, k, _ = meet(c, ray, False)
-    row = np.array(slope(c, ray, t, k))
+    c, away = frozen(cap), np.sqrt(cap[0] ** 2 + cap[1] ** 2 + cap[2] ** 2)
+    r = (Single(ray[0]), Single(ray[1]), Single(ray[2]))
+    q = [Single((away * ray[i] - cap[i]) / cap[RADIUS]) for i in range(3)]
+    t, k, _ = meet(c, (q[0], q[1], q[2]), r, False)
+    q = [q[i] + t * r[i] for i in range(3)]
+    row = np.array(slope(c, (q[0], q[1], q[2]), r, k))
+    t = away + t * cap[RADIUS]
     variance = 0.0
     for i in range(UNKNOWNS):
         for j in range(UNKNOWNS):
             variance += row[3 + i] * covariance[i, j] * row[3 + j]
     square = max(row[2], 0.1) ** 2  # of the cosine of incidence
-    far = t + row[0] / (row[1] * max(row[2], 0.3))  # a step to the surface with its bulge
+    far = t + row[0] / max(row[2], 0.3)  # a step to the surface with its bulge
     across = (sigma * t) ** 2
     # an error across the ray moves the point up or down the slope
     along = (variance + across * (1.0 - square)) / square

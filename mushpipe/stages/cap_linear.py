@@ -6,31 +6,37 @@ from typing import Any
 
 import numpy as np
 
-from mushpipe.core.jit import jit
-from mushpipe.stages.cap_model import UNKNOWNS, Floats
+from mushpipe.core.jit import inlined, jit
+from mushpipe.stages.cap_model import UNKNOWNS, Floats, Singles
 
 
 @jit
-def add(system: Any, rows: Floats, count: int) -> None:
-    """Add `count` columns of rows (9, M), derivatives and residual, already times root weight.
+def multiply(rows: Singles, count: int, system: Any) -> None:
+    """Fill the lower triangle of a normal matrix, and the gradient, from weighted rows.
 
-    The lower triangle of the normal matrix and the gradient grow by their products.
+    Args:
+        rows: (9 or more, M) derivatives and residual, times the root of their weight.
+        count: How many columns are rows.
+        system: Normal matrix (8, 8) and gradient (8,), out.
     """
     normal, gradient = system
     for i in range(UNKNOWNS):
         for j in range(i + 1):
-            total = 0.0
-            for k in range(count):
-                total += rows[i, k] * rows[j, k]
-            normal[i, j] += total
-        total = 0.0
-        for k in range(count):
-            total += rows[i, k] * rows[UNKNOWNS, k]
-        gradient[i] += total
+            normal[i, j] = dot(rows[i], rows[j], count)
+        gradient[i] = dot(rows[i], rows[UNKNOWNS], count)
+
+
+@inlined
+def dot(a: Singles, b: Singles, count: int) -> float:
+    """Return the sum of the first `count` products."""
+    total = np.float32(0)
+    for k in range(count):
+        total += a[k] * b[k]
+    return total
 
 
 @jit
-def scale(rows: Floats, weights: Floats, count: int) -> None:
+def scale(rows: Singles, weights: Singles, count: int) -> None:
     """Multiply `count` columns of rows (9, M) by the roots of their weights (M,)."""
     for k in range(count):
         weights[k] = np.sqrt(weights[k])

@@ -11,7 +11,8 @@ A cap is held in an array of 15: C, n, R, h, b, and two unit vectors e1, e2 that
 across n. Lengths are metres, in the camera's optical frame.
 
 Kernels assume finite numbers. They take a cap as a tuple and rays as scalars, and loop over columns
-of arrays (k, M), so that the compiler can work on several rays at once.
+of arrays (k, M), so that the compiler can work on several rays at once. That is done in single
+precision: lengths are in rim radii from C, where it is worth a thousandth of a micrometre.
 """
 
 from __future__ import annotations
@@ -24,11 +25,14 @@ from mushpipe.core.jit import inlined, jit
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Cap = tuple[float, ...]
+Single = np.float32
 Vector = tuple[float, float, float]
 LIP = 0.25  # depth of the margin below the rim plane, in rim radii
 SIZE = 15
 N, RADIUS, HEIGHT, BULGE, E1, E2 = 3, 6, 7, 8, 9, 12
-ROOM = 169  # most rays of a cap: 8 around the circle, 97 points, 32 each along depth and color edge
+LANES = 32  # columns that a kernel works on at once
+# most rays of a cap: 8 around the circle, 97 points, 32 each along depth and colour edge; in LANES
+ROOM = 192
 UNKNOWNS = 8  # C (3), turn along e1 and e2 (2), R, h, b
 
 
@@ -61,10 +65,12 @@ def move(cap: Floats, step: Floats) -> None:
 
 @inlined
 def frozen(cap: Floats) -> Cap:
-    """Return the array (15,) as a tuple."""
+    """Return axis, e1, e2, h/R, b and R of the array (15,) as a tuple of singles."""
     return (
-        cap[0], cap[1], cap[2], cap[3], cap[4], cap[5], cap[6],
-        cap[7], cap[8], cap[9], cap[10], cap[11], cap[12], cap[13], cap[14],
+        Single(cap[3]), Single(cap[4]), Single(cap[5]),
+        Single(cap[9]), Single(cap[10]), Single(cap[11]),
+        Single(cap[12]), Single(cap[13]), Single(cap[14]),
+        Single(cap[HEIGHT] / cap[RADIUS]), Single(cap[BULGE]), Single(cap[RADIUS]),
     )  # fmt: skip
 
 
@@ -75,91 +81,91 @@ def dot(a: Vector, b: Vector) -> float:
 
 
 @inlined
-def enter(c: Cap, ray: Vector, k: float, tangent: bool) -> tuple[float, float, bool]:
+def enter(q: Vector, ray: Vector, axis: Vector, k: float, tangent: bool) -> tuple[float, float, bool]:
     """Return (t, s, hit) for one half of a cap, taken as a whole spheroid without bulge.
 
-    Solves A t^2 + 2 B t + G = F^2 - 1 = 0 for the point t ray.
+    Solves A t^2 + 2 B t + G = F^2 - 1 = 0 for the point q + t ray.
 
     Args:
-        c: Cap.
+        q: A point of the ray, from C in radii.
         ray: Unit vector.
-        k: Half-axis along n, m.
+        axis: Unit vector.
+        k: Half-axis along it, in radii.
         tangent: Take the closest approach even where the ray hits.
 
     Returns:
         Where the ray enters, or where it comes closest if it misses; the height of that point over
         the rim plane; and whether it hits.
     """
-    center, axis = (c[0], c[1], c[2]), (c[3], c[4], c[5])
-    inverse = 1.0 / (c[RADIUS] * c[RADIUS])
-    d = 1.0 / (k * k) - inverse
-    un, qn = dot(ray, axis), -dot(center, axis)
-    a = inverse + d * un * un
-    b = d * un * qn - dot(center, ray) * inverse
-    g = dot(center, center) * inverse + d * qn * qn - 1.0
+    d = Single(1) / (k * k) - Single(1)
+    un, qn = dot(ray, axis), dot(q, axis)
+    a = Single(1) + d * un * un
+    b = dot(q, ray) + d * un * qn
+    g = dot(q, q) + d * qn * qn - Single(1)
     free = b * b - a * g
-    t = (-b if tangent else -b - np.sqrt(max(free, 0.0))) / a
-    return t, t * un + qn, free > 0.0
+    root = np.sqrt(max(free, Single(0)))
+    t = -(b + (Single(0) if tangent else root)) / a
+    return t, t * un + qn, free > Single(0)
 
 
 @inlined
-def meet(c: Cap, ray: Vector, tangent: bool) -> tuple[float, float, bool]:
+def meet(c: Cap, q: Vector, ray: Vector, tangent: bool) -> tuple[float, float, bool]:
     """Return (t, k, hit): where a ray meets the cap, in which half, and whether it does at all."""
-    lip = LIP * c[RADIUS]
-    t, s, hit = enter(c, ray, c[HEIGHT], tangent)
-    t_lip, _, hit_lip = enter(c, ray, lip, tangent)
-    dome = s > 0.0
-    return (t if dome else t_lip), (c[HEIGHT] if dome else lip), (hit if dome else hit_lip)
+    axis, lip = (c[0], c[1], c[2]), Single(LIP)
+    t, s, hit = enter(q, ray, axis, c[9], tangent)
+    t_lip, _, hit_lip = enter(q, ray, axis, lip, tangent)
+    dome = s > Single(0)
+    return (t if dome else t_lip), (c[9] if dome else lip), (hit if dome else hit_lip)
 
 
 @inlined
-def slope(c: Cap, ray: Vector, t: float, k: float) -> tuple[float, ...]:
-    """Return P = F - 1 - b w at the point t ray, in the half with half-axis k, and how it changes.
+def slope(c: Cap, q: Vector, ray: Vector, k: float) -> tuple[float, ...]:
+    """Return P = F - 1 - b w at the point q of a ray, in the half with half-axis k, and its change.
+
+    Args:
+        c: From `frozen`.
+        q: From C in radii.
+        ray: Unit vector.
+        k: In radii.
 
     Returns:
-        P, |grad P| and |cos| of incidence; then the derivative of P by C, the two turns, R, h and
-        b, over |grad P|: that of the distance to the surface, positive where it recedes.
+        P over |grad P|, m; 1 over |grad P|, in radii; and |cos| of incidence. Then the derivative
+        of P by C, the two turns, R, h and b, over |grad P|: that of the distance to the surface,
+        m, positive where it recedes.
     """
-    q = (t * ray[0] - c[0], t * ray[1] - c[1], t * ray[2] - c[2])
-    axis = (c[3], c[4], c[5])
-    inverse = 1.0 / (c[RADIUS] * c[RADIUS])
-    d = 1.0 / (k * k) - inverse
+    one, two, four, least = Single(1), Single(2), Single(4), Single(1e-12)
+    axis, bulge, radius = (c[0], c[1], c[2]), c[10], c[11]
+    d, per_k = one / (k * k) - one, one / k
     s, square = dot(q, axis), dot(q, q)
-    dome = 1.0 if s > 0.0 else 0.0  # a factor, for branches keep rays from being worked on at once
-    f = np.sqrt(max(square * inverse + d * s * s, 1e-12))
-    x = dome * s * s / (k * k * f * f)
+    dome = one if s > Single(0) else Single(0)  # a factor, for branches keep rays from going at once
+    by_half = s * s * per_k * per_k  # k is h on the dome and LIP R on the margin
+    per_f = one / np.sqrt(max(square + d * s * s, least))
+    x = dome * by_half * per_f * per_f
     # w depends on F and on s: dP = own dF + by_s ds
-    bend = dome * 4.0 * c[BULGE] * (1.0 - 2.0 * x)
-    own = (1.0 + 2.0 * bend * x / f) / f
-    by_s = -2.0 * bend * s / (k * k * f * f)
-    lean = own * d * s + by_s
-    g = (
-        own * q[0] * inverse + lean * axis[0],
-        own * q[1] * inverse + lean * axis[1],
-        own * q[2] * inverse + lean * axis[2],
-    )
-    length = np.sqrt(max(dot(g, g), 1e-12))
-    over = 1.0 / length
-    by_radius = max(square - s * s, 0.0) * inverse / c[RADIUS]
-    by_half = s * s / (k * k)  # k is h on the dome and LIP R on the margin
-    w = 4.0 * x * (1.0 - x)
+    bend = dome * four * bulge * (one - two * x)
+    own = (one + two * bend * x * per_f) * per_f
+    lean = own * d * s - two * bend * s * per_k * per_k * per_f * per_f
+    g = (own * q[0] + lean * axis[0], own * q[1] + lean * axis[1], own * q[2] + lean * axis[2])
+    over = one / np.sqrt(max(dot(g, g), least))
+    w = four * x * (one - x)
+    rim = max(square - s * s, Single(0))
     return (
-        f - 1.0 - c[BULGE] * w,
-        length,
+        (one / per_f - one - bulge * w) * over * radius,
+        over,
         abs(dot(g, ray)) * over,
         -g[0] * over,
         -g[1] * over,
         -g[2] * over,
-        lean * dot(q, (c[E1], c[E1 + 1], c[E1 + 2])) * over,
-        lean * dot(q, (c[E2], c[E2 + 1], c[E2 + 2])) * over,
-        -own * (by_radius + (1.0 - dome) * by_half / c[RADIUS]) * over,
-        dome * (2.0 * bend * x - own * by_half) / k * over,
-        -w * over,
+        lean * dot(q, (c[3], c[4], c[5])) * over * radius,
+        lean * dot(q, (c[6], c[7], c[8])) * over * radius,
+        -own * (rim + (one - dome) * by_half) * over,
+        dome * (two * bend * x - own * by_half) * per_k * over,
+        -w * over * radius,
     )
 
 
 @jit
-def fill_rows(cap: Floats, rays: Singles, count: int, flat: Floats) -> None:
+def fill_rows(cap: Floats, rays: Singles, count: int, flat: Singles) -> None:
     """Fill a column of rows for each ray.
 
     A ray with a range has hit the cap there: its residual is the distance from that point to the
@@ -177,19 +183,26 @@ def fill_rows(cap: Floats, rays: Singles, count: int, flat: Floats) -> None:
             fixed distances the compiler sees that nothing overlaps.
     """
     c = frozen(cap)
+    x, y, z = Single(cap[0]), Single(cap[1]), Single(cap[2])
+    middle, per_radius = np.sqrt(x * x + y * y + z * z), Single(1) / c[11]
     for i in range(4):
         for j in range(count):
             flat[(10 + i) * ROOM + j] = rays[i, j]
     for j in range(count):
         ray = (flat[j + 10 * ROOM], flat[j + 11 * ROOM], flat[j + 12 * ROOM])
-        touches = flat[j + 13 * ROOM] == 0.0
-        t, k, crosses = meet(c, ray, touches)
+        far = flat[j + 13 * ROOM]
+        touches = far == Single(0)
+        # where the ray is as far away as C
+        q0, q1 = (middle * ray[0] - x) * per_radius, (middle * ray[1] - y) * per_radius
+        q2 = (middle * ray[2] - z) * per_radius
+        t, k, crosses = meet(c, (q0, q1, q2), ray, touches)
         hit = crosses & (not touches)
-        p, length, cosine, d0, d1, d2, d3, d4, d5, d6, d7 = slope(c, ray, t, k)
+        q = (q0 + t * ray[0], q1 + t * ray[1], q2 + t * ray[2])
+        p, _, cosine, d0, d1, d2, d3, d4, d5, d6, d7 = slope(c, q, ray, k)
         flat[j], flat[j + ROOM], flat[j + 2 * ROOM], flat[j + 3 * ROOM] = d0, d1, d2, d3
         flat[j + 4 * ROOM], flat[j + 5 * ROOM] = d4, d5
         flat[j + 6 * ROOM], flat[j + 7 * ROOM] = d6, d7
         # one Newton step from the spheroid without bulge to the surface with it
-        off = cosine * (t - flat[j + 13 * ROOM])
-        flat[j + 8 * ROOM] = p / length + (off if hit else 0.0)
-        flat[j + 9 * ROOM] = cosine if hit else (1.0 if touches else 0.0)
+        off = cosine * (t * c[11] + middle - far)
+        flat[j + 8 * ROOM] = p + (off if hit else Single(0))
+        flat[j + 9 * ROOM] = cosine if hit else (Single(1) if touches else Single(0))

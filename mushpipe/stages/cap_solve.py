@@ -7,17 +7,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mushpipe.core.jit import jit
-from mushpipe.stages.cap_linear import add, cholesky, scale, substitute, tukey
+from mushpipe.stages.cap_linear import cholesky, multiply, scale, substitute, tukey
 from mushpipe.stages.cap_model import (
     BULGE,
     E1,
     E2,
     HEIGHT,
+    LANES,
     RADIUS,
     ROOM,
     UNKNOWNS,
     Floats,
     N,
+    Single,
     Singles,
     fill_rows,
     move,
@@ -25,7 +27,7 @@ from mushpipe.stages.cap_model import (
 
 ROUND = 8  # rays around the detected circle, the first columns of a cap's rays
 _TURN = np.arange(ROUND) * (2 * np.pi / ROUND)
-WAVES: Floats = np.stack([np.ones(ROUND), np.cos(_TURN), np.sin(_TURN)]) / ROUND
+WAVES = (np.stack([np.ones(ROUND), np.cos(_TURN), np.sin(_TURN)]) / ROUND).astype(np.float32)
 BULGE_LIMIT = 0.15  # beyond, the profile is no longer convex
 POINT_CUTS = np.array([400.0, 81.0, 81.0, 16.0])
 TOUCH_CUTS = np.array([25.0, 25.0, 9.0, 9.0])
@@ -80,26 +82,31 @@ def weigh(
         Sum of the robust weights of the points, and how many times as large as stated the squared
         residuals are.
     """
-    surface, outline = (noise.shape * radius) ** 2, (noise.outline * radius) ** 2
-    far_cut, touch_cut = POINT_CUTS[min(step, STEPS - 1)], TOUCH_CUTS[min(step, STEPS - 1)]
-    total, misfit, shares = 0.0, 0.0, 0.0
+    surface, outline = Single((noise.shape * radius) ** 2), Single((noise.outline * radius) ** 2)
+    far_cut = Single(POINT_CUTS[min(step, STEPS - 1)])
+    touch_cut = Single(TOUCH_CUTS[min(step, STEPS - 1)])
+    none, missing = Single(0), Single(0.7 * pixel)
+    total, misfit, shares = none, none, none
     for j in range(count):
         far, sigma, share = rays[3, j], rays[4, j], rays[5, j]
         cosine, residual = rows[UNKNOWNS + 1, j], rows[UNKNOWNS, j]
-        touches = far == 0.0
-        missed = 0.7 * far * pixel if cosine == 0.0 else 0.0
-        variance = (outline if touches else surface) + (sigma * cosine) ** 2 + missed**2
-        squared, cut = residual * residual / variance, touch_cut if touches else far_cut
-        weight = tukey(squared, cut)
-        total += 0.0 if touches else weight
+        touches = far == none
+        missed = missing * far if cosine == none else none
+        spread = sigma * cosine
+        variance = (outline if touches else surface) + spread * spread + missed * missed
+        per_variance = Single(1) / variance
+        squared, cut = residual * residual * per_variance, touch_cut if touches else far_cut
+        rest = max(Single(1) - squared / cut, none)
+        weight = rest * rest
+        total += none if touches else weight
         misfit += share * min(squared, cut)
         shares += share
-        weights[j] = share * weight / variance
+        weights[j] = share * weight * per_variance
     if step >= STEPS - 1:
-        factor = (noise.firm + misfit / noise.usual) / (noise.firm + shares)
+        factor = Single((noise.firm + shares) / (noise.firm + misfit / noise.usual))
         for j in range(count):
-            weights[j] /= factor
-    return total, misfit / max(shares, 1e-9)
+            weights[j] *= factor
+    return float(total), misfit / max(float(shares), 1e-9)
 
 
 @jit
@@ -110,7 +117,7 @@ def weigh_circle(rows: Floats, variance: float, cut: float, weights: Floats) -> 
     need not, for the outline of a cap is no circle.
     """
     for i in range(UNKNOWNS + 1):
-        mean, cosine, sine = 0.0, 0.0, 0.0
+        mean, cosine, sine = Single(0), Single(0), Single(0)
         for j in range(ROUND):
             mean += WAVES[0, j] * rows[i, j]
             cosine += WAVES[1, j] * rows[i, j]
@@ -173,8 +180,18 @@ def limit(cap: Floats, step: Floats, size: float) -> None:
 def workspace() -> Any:
     """Return normal matrix (8, 8) and gradient (8,), rows flat and not, and weights (ROOM,)."""
     system = (np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS))
-    flat = np.zeros(14 * ROOM)
-    return system, flat, flat.reshape(14, ROOM), np.empty(ROOM)
+    flat = np.zeros(14 * ROOM, np.float32)
+    return system, flat, flat.reshape(14, ROOM), np.empty(ROOM, np.float32)
+
+
+@jit
+def fill_up(rays: Singles, count: int) -> int:
+    """Fill rays (6, M) that count nothing up to the next multiple of LANES; return that."""
+    padded = (count + LANES - 1) // LANES * LANES
+    for j in range(count, padded):
+        rays[:, j] = 0.0
+        rays[2, j], rays[4, j] = 1.0, 1.0
+    return padded
 
 
 @jit
@@ -205,14 +222,14 @@ def refine(
     normal, gradient = system
     noise, pixel, size = settings
     total, misfit = 0.0, 0.0
+    padded = fill_up(rays, count)
     for step in range(steps[0], steps[1]):
-        normal[:], gradient[:] = 0.0, 0.0
-        fill_rows(cap, rays, count, flat)
-        total, misfit = weigh(rows, rays, count, noise, pixel, cap[RADIUS], step, weights)
+        fill_rows(cap, rays, padded, flat)
+        total, misfit = weigh(rows, rays, padded, noise, pixel, cap[RADIUS], step, weights)
         variance = (noise.circle_px * pixel * cap[2]) ** 2 + (noise.outline * cap[RADIUS]) ** 2
         weigh_circle(rows, variance, TOUCH_CUTS[min(step, STEPS - 1)], weights)
-        scale(rows, weights, count)
-        add(system, rows, count)
+        scale(rows, weights, padded)
+        multiply(rows, padded, system)
         add_priors(cap, upright, noise, system)
         if not cholesky(normal):
             return -1.0, misfit
