@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
 from mushpipe.stages.cap_attempt import COUNTS, ODD, POOR, fit_circle, mend, scratch
+from mushpipe.stages.cap_blocks import CELLS
 from mushpipe.stages.cap_model import (
     HEIGHT,
     RADIUS,
@@ -25,13 +26,8 @@ from mushpipe.stages.cap_model import (
     meet,
     slope,
 )
-from mushpipe.stages.cap_order import rank_by_depth
-from mushpipe.stages.cap_samples import (
-    ASTRAY,
-    CELLS,
-    DIRECTIONS,
-    ray_at,
-)
+from mushpipe.stages.cap_order import Order
+from mushpipe.stages.cap_samples import ASTRAY, DIRECTIONS, ray_at
 from mushpipe.stages.cap_solve import ROUND, Noise, invert, refine, tilt, workspace
 from mushpipe.stages.cap_start import spread_of
 
@@ -82,25 +78,27 @@ class Fits:
 
 @jit
 def first_fits(
-    frame: Any, circles: Floats, upright: tuple[Floats, float], settings: Any, rays: Singles,
-    out: Any,
+    frame: Any, circles: Floats, rank: NDArray[np.int64], upright: tuple[Floats, float],
+    settings: Any, rays: Singles, out: Any,
 ) -> None:  # fmt: skip
     """Gather the rays of every cap, and fit it with the same prior for all.
 
     Args:
-        frame: Luma (H, W), image (see `sample_depth`) and focal length, px.
+        frame: Luma (H, W); depth (H, W) m, missing where not above 0, with rays (H, W, 2) and
+            ranks (H, W); focal length, px.
         circles: (N, 3) x, y, radius, px.
+        rank: (N,) of them, as `ranks` from `by_depth`.
         upright: Unit vector (3,) and spread of tilts, rad.
         settings: `Noise`; sigma of depth (2), bias (m) and edge offset (px); sigma of the outline
             in colour, px; fewest points.
         rays: (N, 6, ROOM) room for those of each cap.
-        out: Per cap parameters, covariance, surface point with sigmas, and counts as `fit_circle`
-            fills them. A cap without a fit keeps a count of 0.
+        out: Per cap parameters, covariance, surface point with sigmas, and counts; parameters and
+            counts are filled as by `fit_circle`. A cap without a fit keeps a count of 0.
     """
-    caps, covariances, _, counts = out
-    rank, room = rank_by_depth(frame[1][0], circles, frame[1][2]), scratch()
+    caps, _, _, counts = out
+    room = scratch()
     for i in range(len(circles)):
-        fit, ranks = (rays[i], caps[i], covariances[i], counts[i]), (rank[i], len(circles))
+        fit, ranks = (rays[i], caps[i], counts[i]), (rank[i], len(circles))
         misfit = fit_circle(frame, circles[i], rank[i], upright, settings, fit, room)
         if ODD < misfit < np.inf:
             mend(frame, circles[i], ranks, misfit, upright, settings, fit, room)
@@ -120,7 +118,7 @@ def second_fits(
         if counts[i, 0] > 0:
             first, second = tilt(caps[i], upright[0])
             squares[i] = first * first + second * second
-            variances[i] = 0.5 * (covariances[i, 3, 3] + covariances[i, 4, 4])
+            variances[i] = counts[i, 7]
     spreads, work = np.empty(len(caps)), workspace()
     spread_of(squares, variances, upright[1], spreads)
     for i in range(len(caps)):
@@ -171,15 +169,17 @@ def locate(cap: Floats, ray: Vector, covariance: Floats, sigma: float, out: Floa
 def fit_caps(
     frame: tuple[NDArray[np.float32], tuple[NDArray[np.float32], NDArray[np.float32]], float],
     circles: Floats,
+    order: Order,
     upright: tuple[Floats, float],
     settings: tuple[Noise, tuple[float, float, float, float], float, int],
 ) -> Fits:
     """Fit a cap to the depth in each circle.
 
     Args:
-        frame: Luma (H, W) 0..1; depth (H, W) m, 0 = missing, finite, and the rays (H, W, 2) of the
-            pixels at z = 1; focal length, px.
+        frame: Luma (H, W) 0..1; depth (H, W) m, missing where not above 0, and the rays (H, W, 2)
+            of the pixels at z = 1; focal length, px.
         circles: (N, 3) x, y, radius, px.
+        order: From `by_depth`.
         upright: Unit vector (3,) and the spread of tilts off it per direction, rad.
         settings: Standard deviations of the model; of the sensor: sigma of depth at the camera (m)
             and its growth (m per m), bias (m), and how much of an edge it loses (px); sigma of the
@@ -194,8 +194,9 @@ def fit_caps(
         np.zeros((n, COUNTS)),
     )
     rays = np.empty((n, 6, ROOM), np.float32)
-    ranked = (gray, (*image, np.full(image[0].shape, n, np.int16)), focal)
-    first_fits(ranked, circles, upright, settings, rays, out)
+    rank, ranks = order
+    ranked = (gray, (*image, ranks), focal)
+    first_fits(ranked, circles, rank, upright, settings, rays, out)
     second_fits(ranked, circles, upright, settings, rays, out)
     return _fits(*out)
 

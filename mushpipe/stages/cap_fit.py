@@ -18,6 +18,7 @@ from mushpipe import (
     quaternion_from_axis,
 )
 from mushpipe.stages.cap_batch import Fits, fit_caps
+from mushpipe.stages.cap_order import Order, by_depth
 from mushpipe.stages.cap_solve import Noise
 from mushpipe.stages.surface_fit import fit_tops, sources, variance_along, without_tip
 from mushpipe.stages.upright import Up, pixel_rays, upright
@@ -57,12 +58,12 @@ class CapFit(Stage):
         """Compile the kernels."""
         camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
         circles = Circles(np.array([[32.0, 24.0]]), np.array([9.0]), np.ones(1))
-        gray = np.zeros((48, 64), np.float32)
-        depth = np.full((48, 64), 0.4, np.float32)
+        gray, depth = np.zeros((48, 64), np.float32), np.full((48, 64), 0.4, np.float32)
         # arrays of a frame are read-only, which to the compiler is a type of its own
-        gray.flags.writeable = False
-        fits = self.fit(gray, depth, camera, circles)
-        self._bridge(np.arange(1), fits, depth, camera, circles)
+        gray.flags.writeable = depth.flags.writeable = False
+        order = by_depth(depth, _discs(circles))
+        fits = self.fit(gray, depth, camera, circles, order)
+        self._bridge(np.arange(1), fits, depth, camera, circles, order)
 
     def process(self, frame: RgbdFrame, circles: Circles) -> tuple[Locations, Poses]:
         """Return one location and one pose per circle.
@@ -77,12 +78,13 @@ class CapFit(Stage):
                 "depth cannot be turned into metres without the camera's calibration: record "
                 "camera_info, or set source.camera: {fx: , fy: , cx: , cy: }"
             )
-        depth = np.fmax(frame.depth_m, np.float32(0))  # missing: 0 in place of NaN
-        fits = self.fit(frame.gray, depth, frame.camera, circles)
+        depth = frame.depth_m
+        order = by_depth(depth, _discs(circles))
+        fits = self.fit(frame.gray, depth, frame.camera, circles, order)
         source = np.where(fits.valid, sources(circles, depth), DepthSource.MISSING)
         holes = np.flatnonzero(source == DepthSource.NEIGHBOURS)
         if len(holes):
-            self._bridge(holes, fits, depth, frame.camera, circles)
+            self._bridge(holes, fits, depth, frame.camera, circles, order)
         return _locations(fits, source.astype(np.uint8)), _poses(fits)
 
     def fit(
@@ -91,16 +93,18 @@ class CapFit(Stage):
         depth: NDArray[np.float32],
         camera: Camera,
         circles: Circles,
+        order: Order | None = None,
     ) -> Fits:
         """Return the fitted caps themselves.
 
         Args:
             gray: (H, W) luma, 0..1.
-            depth: (H, W) m, 0 = missing, finite.
+            depth: (H, W) m, missing where not above 0.
             camera: Intrinsics.
             circles: Outlines, px.
+            order: From `by_depth`, if that is known.
         """
-        rays = pixel_rays(camera)
+        rays, discs = pixel_rays(camera), _discs(circles)
         noise = Noise(
             shape=0.027,
             outline=0.03,
@@ -120,7 +124,8 @@ class CapFit(Stage):
         )
         return fit_caps(
             (gray, (depth, rays), (camera.fx + camera.fy) / 2),
-            np.column_stack([circles.center, circles.radius]),
+            discs,
+            order or by_depth(depth, discs),
             (upright(self.up, depth, rays), float(np.radians(self.tilt_deg))),
             (noise, sensor, self.outline_sigma_px, self.min_points),
         )
@@ -132,11 +137,12 @@ class CapFit(Stage):
         depth: NDArray[np.float32],
         camera: Camera,
         circles: Circles,
+        order: Order,
     ) -> None:
         """Put the surface over holes at a centre, as `surface-fit` does: spheroids have no tip."""
-        discs = np.column_stack([circles.center, circles.radius])
+        discs = _discs(circles)
         noise = (self.depth_noise_mm / 1000, self.depth_noise_per_m / 1000)
-        surface, covariance, _ = fit_tops(depth, camera, discs, noise, LEAST, holes)
+        surface, covariance, _ = fit_tops(depth, camera, discs, noise, LEAST, holes, order)
         rows = holes[np.isfinite(surface[holes, 0])]
         tops, discs = (surface[rows], covariance[rows]), discs[rows]
         focal = (camera.fx + camera.fy) / 2
@@ -145,6 +151,10 @@ class CapFit(Stage):
         along = variance_along(without_tip(*tops)[0], tops[1], size, pixel)
         fits.surface[rows] = camera.deproject(discs[:, :2], z)
         fits.sigma_surface[rows, 2] = np.maximum(fits.sigma_surface[rows, 2], np.sqrt(along))
+
+
+def _discs(circles: Circles) -> Floats:
+    return np.column_stack([circles.center, circles.radius])
 
 
 def _locations(fits: Fits, source: NDArray[np.uint8]) -> Locations:

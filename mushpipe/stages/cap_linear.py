@@ -32,7 +32,7 @@ def dot(a: Singles, b: Singles, count: int) -> float:
     total = np.float32(0)
     for k in range(count):
         total += a[k] * b[k]
-    return total
+    return float(total)
 
 
 @jit
@@ -55,11 +55,12 @@ def cholesky(matrix: Floats) -> bool:
         if not 1e-12 < pivot < 1e30:
             return False
         matrix[j, j] = np.sqrt(pivot)
+        over = 1.0 / matrix[j, j]
         for i in range(j + 1, UNKNOWNS):
             value = matrix[i, j]
             for k in range(j):
                 value -= matrix[i, k] * matrix[j, k]
-            matrix[i, j] = value / matrix[j, j]
+            matrix[i, j] = value * over
     return True
 
 

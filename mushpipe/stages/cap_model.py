@@ -17,6 +17,8 @@ precision: lengths are in rim radii from C, where it is worth a thousandth of a 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,7 +27,7 @@ from mushpipe.core.jit import inlined, jit
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Cap = tuple[float, ...]
-Single = np.float32
+Single: Any = np.float32  # to type checkers a float
 Vector = tuple[float, float, float]
 LIP = 0.25  # depth of the margin below the rim plane, in rim radii
 SIZE = 15
@@ -81,7 +83,9 @@ def dot(a: Vector, b: Vector) -> float:
 
 
 @inlined
-def enter(q: Vector, ray: Vector, axis: Vector, k: float, tangent: bool) -> tuple[float, float, bool]:
+def enter(
+    q: Vector, ray: Vector, axis: Vector, k: float, tangent: bool
+) -> tuple[float, float, bool]:
     """Return (t, s, hit) for one half of a cap, taken as a whole spheroid without bulge.
 
     Solves A t^2 + 2 B t + G = F^2 - 1 = 0 for the point q + t ray.
@@ -137,7 +141,7 @@ def slope(c: Cap, q: Vector, ray: Vector, k: float) -> tuple[float, ...]:
     axis, bulge, radius = (c[0], c[1], c[2]), c[10], c[11]
     d, per_k = one / (k * k) - one, one / k
     s, square = dot(q, axis), dot(q, q)
-    dome = one if s > Single(0) else Single(0)  # a factor, for branches keep rays from going at once
+    dome = one if s > Single(0) else Single(0)  # a factor: branches hinder SIMD
     by_half = s * s * per_k * per_k  # k is h on the dome and LIP R on the margin
     per_f = one / np.sqrt(max(square + d * s * s, least))
     x = dome * by_half * per_f * per_f

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from mushpipe.core.jit import jit
 from mushpipe.stages.cap_model import Floats, Singles
 
+Order = tuple[NDArray[np.int64], NDArray[np.int16]]
+
 
 @jit
 def paint(ranks: NDArray[np.int16], circles: Floats, order: NDArray[np.int64]) -> None:
@@ -24,9 +26,7 @@ def paint(ranks: NDArray[np.int16], circles: Floats, order: NDArray[np.int64]) -
         for v in range(max(0, int(np.ceil(y - r))), min(height, int(np.floor(y + r)) + 1)):
             half = np.sqrt(max(r * r - (v - y) ** 2, 0.0))
             left = max(0, int(np.ceil(x - half)))
-            right = min(width, int(np.floor(x + half)) + 1)
-            for u in range(left, right):
-                ranks[v, u] = rank
+            ranks[v, left : max(left, min(width, int(np.floor(x + half)) + 1))] = rank
 
 
 @jit
@@ -44,9 +44,19 @@ def core_depth(depth: Singles, circle: Floats) -> float:
     return float(np.median(values[:n])) if n else 0.0
 
 
+def by_depth(depth: Singles, circles: Floats) -> Order:
+    """Return each circle's rank (N,), the nearest 0, and the lowest on each pixel (H, W), else N.
+
+    Args:
+        depth: (H, W) m, missing where not above 0.
+        circles: (N, 3) x, y, radius, px.
+    """
+    ranks = np.full(depth.shape, len(circles), np.int16)
+    return _rank(depth, circles, ranks), ranks
+
+
 @jit
-def rank_by_depth(depth: Singles, circles: Floats, ranks: NDArray[np.int16]) -> NDArray[np.int64]:
-    """Return each circle's rank (N,), the nearest 0, and paint them over a `ranks` full of N."""
+def _rank(depth: Singles, circles: Floats, ranks: NDArray[np.int16]) -> NDArray[np.int64]:
     far = np.empty(len(circles))
     for i in range(len(circles)):
         far[i] = core_depth(depth, circles[i])

@@ -9,29 +9,50 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
-from mushpipe.stages.cap_model import ROOM, UNKNOWNS, Floats, Singles, fill_rows
+from mushpipe.stages.cap_model import ROOM, UNKNOWNS, Floats, Single, Singles, fill_rows
 from mushpipe.stages.cap_samples import COMPASS, DIRECTIONS, EDGE_SHARE, ray_at, touch
 
 STEP = 0.5  # px between places on a line
 REACH = 12  # steps to either side that are looked at, at most
+EDGE = 1.01  # px, from a last place to the image's, rounding of single precision included
 LEAST_STEP = 0.04  # of luma, between 1 px inside and 1 px outside
 
 
 @jit
-def bright(gray: NDArray[np.float32], x: float, y: float) -> float:
-    """Return the bilinear luma at a place in the image, -1 outside."""
-    u, v = int(np.floor(x)), int(np.floor(y))
-    if u < 0 or v < 0 or u + 1 >= gray.shape[1] or v + 1 >= gray.shape[0]:
-        return -1.0
-    fx, fy = x - u, y - v
-    top = gray[v, u] * (1.0 - fx) + gray[v, u + 1] * fx
-    low = gray[v + 1, u] * (1.0 - fx) + gray[v + 1, u + 1] * fx
-    return float(top * (1.0 - fy) + low * fy)
+def look_along(
+    gray: Singles, x: float, y: float, turn: Floats, half: int, profile: Singles
+) -> bool:
+    """Fill the luma (2 half + 1,) along a line, bilinear; False where it leaves the image.
+
+    Args:
+        gray: (H, W) luma.
+        x: Of the middle of the line, px.
+        y: Likewise.
+        turn: (2,) its direction.
+        half: Number of steps to either side.
+        profile: Out.
+    """
+    far_x, far_y = half * STEP * abs(turn[0]), half * STEP * abs(turn[1])
+    if not (
+        far_x <= x < gray.shape[1] - EDGE - far_x and far_y <= y < gray.shape[0] - EDGE - far_y
+    ):
+        return False
+    one, dx, dy = np.uint32(1), Single(STEP * turn[0]), Single(STEP * turn[1])
+    left, top = Single(x - half * STEP * turn[0]), Single(y - half * STEP * turn[1])
+    for k in range(2 * half + 1):
+        at_x = max(left + Single(k) * dx, Single(0))
+        at_y = max(top + Single(k) * dy, Single(0))
+        u, v = np.uint32(at_x), np.uint32(at_y)
+        fx, fy = at_x - Single(u), at_y - Single(v)
+        up = gray[v, u] + fx * (gray[v, u + one] - gray[v, u])
+        low = gray[v + one, u] + fx * (gray[v + one, u + one] - gray[v + one, u])
+        profile[k] = up + fy * (low - up)
+    return True
 
 
 @jit
 def expected_reach(
-    cap: Floats, rays: Singles, focal: float, circle: Floats, flat: Floats, reach: Floats
+    cap: Floats, rays: Singles, focal: float, circle: Floats, flat: Singles, reach: Floats
 ) -> None:
     """Fill how far (DIRECTIONS,), px, the outline of a cap lies from the centre of a circle.
 
@@ -56,7 +77,7 @@ def expected_reach(
 
 
 @jit
-def steepest(profile: Floats, count: int, sign: float) -> tuple[float, float]:
+def steepest(profile: Singles, count: int, sign: float) -> tuple[float, float]:
     """Return where a profile (count,) falls (sign 1) or rises (-1) most steeply, and by how much.
 
     The place is in steps, to a fraction of one by a parabola, and -1 where it lies at an end.
@@ -82,7 +103,7 @@ def steepest(profile: Floats, count: int, sign: float) -> tuple[float, float]:
 @jit
 def sample_outline(
     gray: Singles, rays: Singles, ranks: NDArray[np.int16], rank: int, cap: Floats, circle: Floats,
-    focal: float, sigma: float, flat: Floats, out: Singles,
+    focal: float, sigma: float, flat: Singles, out: Singles,
 ) -> int:  # fmt: skip
     """Find the outline of a cap in the colour image, in 32 directions.
 
@@ -101,7 +122,7 @@ def sample_outline(
     Returns:
         Number of rays.
     """
-    profiles, reaches = np.empty((DIRECTIONS, 2 * REACH + 1)), np.empty(DIRECTIONS)
+    profiles, reaches = np.empty((DIRECTIONS, 2 * REACH + 1), np.float32), np.empty(DIRECTIONS)
     expected_reach(cap, rays, focal, circle, flat, reaches)
     half = min(REACH, max(5, int(0.2 * circle[2] / STEP)))
     count, contrast = 2 * half + 1, 0.0
@@ -114,12 +135,7 @@ def sample_outline(
         u, v = int(np.floor(x + 0.5)), int(np.floor(y + 0.5))
         if not (0 <= u < ranks.shape[1] and 0 <= v < ranks.shape[0]) or ranks[v, u] < rank:
             continue
-        known = True
-        for k in range(count):
-            along = (k - half) * STEP
-            profiles[j, k] = bright(gray, x + along * turn[0], y + along * turn[1])
-            known = known and profiles[j, k] >= 0.0
-        if known:
+        if look_along(gray, x, y, turn, half, profiles[j]):
             reaches[j] = reach
             contrast += profiles[j, 0] - profiles[j, count - 1]
     n = 0

@@ -25,7 +25,7 @@ def look(image: Any, circle: Floats, j: int, far: float) -> tuple[float, int]:
     """Return depth (m, 0 = missing) and rank (-1 out of the image) in a direction of `COMPASS`.
 
     Args:
-        image: Depth (H, W) m; rays; ranks (H, W), as many as there are circles where there is none.
+        image: Depth (H, W) m, missing where not above 0; rays; ranks (H, W) from `by_depth`.
         circle: (3,) x, y, radius, px.
         j: Number of the direction.
         far: Distance from the centre, px.
@@ -34,7 +34,7 @@ def look(image: Any, circle: Floats, j: int, far: float) -> tuple[float, int]:
     u = int(np.floor(circle[0] + far * COMPASS[j, 0] + 0.5))
     v = int(np.floor(circle[1] + far * COMPASS[j, 1] + 0.5))
     if 0 <= v < depth.shape[0] and 0 <= u < depth.shape[1]:
-        return float(depth[v, u]), int(ranks[v, u])
+        return float(depth[v, u] if depth[v, u] > 0 else 0), int(ranks[v, u])
     return 0.0, -1
 
 
@@ -121,10 +121,11 @@ def regrow(
             n += 1
     if n < FEWEST:
         return False
-    matrix, off = np.empty((3, 3)), np.array([0.0, 0.0, circle[2]])
+    matrix, right, off = np.empty((3, 3)), np.empty(3), np.array([0.0, 0.0, circle[2]])
     for k in range(ROUNDS):
-        matrix[:] = np.diag(HELD)
-        right = HELD * (np.array([0.0, 0.0, circle[2]]) - off)
+        for a in range(3):
+            matrix[a, :], matrix[a, a] = 0.0, HELD[a]
+            right[a] = HELD[a] * ((circle[2] if a == 2 else 0.0) - off[a])
         cut = max(0.6 - 0.1 * k, 0.2) * off[2]
         for j in range(n):
             x, y = ends[0, j] - off[0], ends[1, j] - off[1]
@@ -136,7 +137,8 @@ def regrow(
                 for b in range(3):
                     matrix[a, b] += weight * row[a] * row[b]
         solve(matrix, right)
-        off += right
+        for a in range(3):
+            off[a] += right[a]
         off[2] = min(max(off[2], 0.6 * circle[2]), 2.0 * circle[2])
     out[0], out[1], out[2] = circle[0] + off[0], circle[1] + off[1], off[2]
     return True

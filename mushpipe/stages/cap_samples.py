@@ -9,89 +9,30 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
+from mushpipe.stages.cap_blocks import CELLS, ENOUGH, GRID, average, middle_depth
+from mushpipe.stages.cap_model import Floats, Single, Singles, Vector
 
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
-Vector = tuple[float, float, float]
-GRID = 11
 DIRECTIONS = 32
 RADII = 26
-INNER, OUTER = 0.55, 1.45  # where an edge is looked for, in radii of the circle
+INNER, OUTER = 0.55, 1.45  # where an edge is looked for, in radii of the circle,
+STEP = (OUTER - INNER) / (RADII - 1)  # in so many steps
 EDGE_PX = 2.0  # sigma of a depth edge
 # Noise and errors of shape are correlated; so much of a point, or of a ray along an edge, counts.
 POINT_SHARE, EDGE_SHARE = 0.35 * 169 / GRID**2, 0.6
 ASTRAY = 1 / 3  # share of other depth in a circle: is what its centre shows the cap at all?
 CORE = 0.35  # squared share of the radius inside which the middle depth is taken
 
-_CENTERS = (np.arange(GRID) + 0.5) / GRID * 2 - 1
-_X, _Y = (axis.ravel() for axis in np.meshgrid(_CENTERS, _CENTERS))
-_INSIDE = _X**2 + _Y**2 <= 1
-CELLS: Floats = np.stack([_X[_INSIDE], _Y[_INSIDE]], axis=-1)
 _TURN = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
 COMPASS: Floats = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=-1)
-
-
-@jit
-def block(
-    depth: Singles,
-    ranks: NDArray[np.int16],
-    rank: int,
-    place: tuple[int, int, int],
-    out: Floats,
-) -> int:
-    """Average the valid pixels of a square block.
-
-    Args:
-        depth: (H, W) m, 0 = missing.
-        ranks: (H, W) rank of the nearest circle that covers the pixel.
-        rank: This circle's; pixels of a lower one are hidden.
-        place: u, v, half width of the block, px.
-        out: (4,) out: mean u and v (px), mean depth (m) and its variance.
-
-    Returns:
-        How many pixels were valid.
-    """
-    height, width = depth.shape
-    u0, v0, half = place
-    count, su, sv, sz, szz = 0, 0, 0, 0.0, 0.0
-    for v in range(max(0, v0 - half), min(height, v0 + half + 1)):
-        row = 0
-        for u in range(max(0, u0 - half), min(width, u0 + half + 1)):
-            z = float(depth[v, u])
-            valid = (z > 0.0) & (ranks[v, u] >= rank)  # a factor is faster than a branch
-            row += valid
-            su += u * valid
-            sz += z * valid
-            szz += z * z * valid
-        count += row
-        sv += v * row
-    if count:
-        mean = sz / count
-        out[0], out[1], out[2] = su / count, sv / count, mean
-        out[3] = max(szz / count - mean * mean, 0.0)
-    return count
-
-
-@jit
-def middle_depth(points: Floats, count: NDArray[np.int64], half: int) -> float:
-    """Return the median depth (m) of the blocks near the centre, 0 without any."""
-    values = np.empty(len(points))
-    n = 0
-    for j in range(len(points)):
-        near = CELLS[j, 0] ** 2 + CELLS[j, 1] ** 2 < CORE
-        if near and count[j] > 0.4 * (2 * half + 1) ** 2:
-            values[n] = points[j, 2]
-            n += 1
-    return float(np.median(values[:n])) if n else 0.0
+EAST, SOUTH = np.cos(_TURN).astype(np.float32), np.sin(_TURN).astype(np.float32)
 
 
 @jit
 def sample_depth(
-    image: Any,
-    rank: int,
+    cut: Any,
+    rays: Singles,
     circle: Floats,
     focal: float,
     noise: tuple[float, float],
@@ -100,9 +41,8 @@ def sample_depth(
     """Take the points of a cap: block means on a grid inside its circle, gated around its depth.
 
     Args:
-        image: Depth (H, W), rays (H, W, 2) at z = 1, beyond 1e3 where a pixel has none, and ranks
-            (H, W) as in `block`.
-        rank: This circle's.
+        cut: From `own_depth`.
+        rays: (H, W, 2) rays at z = 1, beyond 1e3 where a pixel has none.
         circle: (3,) x, y, radius, px.
         focal: Focal length, px.
         noise: Sigma of depth is noise[0] + noise[1] z, m.
@@ -112,17 +52,11 @@ def sample_depth(
         Number of points, number of those outside of the gate, and the cap's middle depth (m), 0
         where there is none.
     """
-    depth, rays, ranks = image
     radius = circle[2]
     half = max(0, int(np.floor(radius / GRID)))
-    full = (2 * half + 1) ** 2
-    points = np.empty((len(CELLS), 4))
-    count = np.empty(len(CELLS), np.int64)
-    for j in range(len(CELLS)):
-        u = int(np.floor(circle[0] + radius * CELLS[j, 0] + 0.5))
-        v = int(np.floor(circle[1] + radius * CELLS[j, 1] + 0.5))
-        count[j] = block(depth, ranks, rank, (u, v, half), points[j])
-    middle = middle_depth(points, count, half)
+    points, count = np.empty((len(CELLS), 4)), np.empty(len(CELLS))
+    average(cut, circle, half, points, count)
+    middle = middle_depth(points, count, half, CORE)
     if middle <= 0.0:
         return 0, 0, 0.0
     size = radius * middle / focal
@@ -131,7 +65,7 @@ def sample_depth(
         z = points[j, 2]
         sigma = noise[0] + noise[1] * z
         even = (2.5 * sigma) ** 2 + (0.6 * size * (2 * half + 1) / radius) ** 2
-        if count[j] <= 0.4 * full or points[j, 3] > even:
+        if count[j] <= ENOUGH * (2 * half + 1) ** 2 or points[j, 3] > even:
             continue
         if not middle - 0.8 * size < z < middle + size:
             other += 1
@@ -147,57 +81,66 @@ def sample_depth(
 
 
 @jit
-def edge_along(
-    depth: NDArray[np.float32],
-    ranks: NDArray[np.int16],
-    rank: int,
-    line: tuple[float, float, float, float],
-    gate: tuple[float, float],
-) -> int:
-    """Return the last step of a cap on a line outwards, -1 where its edge is not to be trusted.
+def follow(cut: Any, circle: Floats, gate: tuple[float, float], state: Singles) -> None:
+    """Find the last step of a cap in each direction, where its edge is to be trusted.
 
     The edge is the maximum of a running sum that rewards what lies within the cap's depth and
     punishes the rest: deeper by 1, nearer or another's by 1/2, missing by 0.15. It counts only
     where something deeper follows within 4 steps, for there the cap ends and is not merely hidden.
 
     Args:
-        depth: (H, W) m, 0 = missing.
-        ranks: (H, W) as in `block`.
-        rank: This circle's.
-        line: x, y of the first step and of a step, px.
+        cut: From `own_depth`.
+        circle: (3,) x, y, radius, px.
         gate: Depths of the cap, m.
+        state: (6 DIRECTIONS,) out, rows of DIRECTIONS: whether it goes on, the sum, its maximum,
+            the step of that (-1 without), and what follows it: 1 something deeper, -1 something
+            nearer, 0 neither yet; then the depth at the last step. In one array at fixed distances
+            the compiler sees that nothing overlaps, and works on several directions at once.
     """
-    height, width = depth.shape
-    best, edge, total, follows = 0.0, -1, 0.0, 0
+    own, (height, width) = cut[0].reshape(-1), cut[0].shape
+    none, one, low, high = Single(0), Single(1), Single(gate[0]), Single(gate[1])
+    half, little, four = Single(0.5), Single(0.15), Single(4)
+    x, y = Single(circle[0] - cut[1] + 0.5), Single(circle[1] - cut[2] + 0.5)
+    pixels = np.empty(DIRECTIONS, np.int32)
+    for j in range(DIRECTIONS):
+        state[j], state[j + DIRECTIONS], state[j + 2 * DIRECTIONS] = one, none, none
+        state[j + 3 * DIRECTIONS], state[j + 4 * DIRECTIONS] = -one, none
     for k in range(RADII):
-        u = int(np.floor(line[0] + k * line[2] + 0.5))
-        v = int(np.floor(line[1] + k * line[3] + 0.5))
-        z, hidden = 0.0, False
-        if 0 <= v < height and 0 <= u < width:
-            z, hidden = float(depth[v, u]), ranks[v, u] < rank
-        if hidden or 0.0 < z < gate[0]:
-            total -= 0.5
-            if follows == 0:
-                follows = -1
-        elif z <= 0.0:
-            total -= 0.15
-        elif z > gate[1]:
-            total -= 1.0
-            if follows == 0 and k <= edge + 4:
-                follows = 1
-        else:
-            total += 1.0
-            if total > best:
-                best, edge, follows = total, k, 0
-        if edge >= 0 and total < best - 4.0:
+        far, step = Single(circle[2] * (INNER + k * STEP)), Single(k)
+        for j in range(DIRECTIONS):
+            u, v = np.int32(np.floor(x + far * EAST[j])), np.int32(np.floor(y + far * SOUTH[j]))
+            inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+            pixels[j] = v * width + u if inside else -1
+        for j in range(DIRECTIONS):
+            state[j + 5 * DIRECTIONS] = own[pixels[j]] if pixels[j] >= 0 else none
+        for j in range(DIRECTIONS):
+            on, total = state[j] > none, state[j + DIRECTIONS]
+            best, edge = state[j + 2 * DIRECTIONS], state[j + 3 * DIRECTIONS]
+            follows, z = state[j + 4 * DIRECTIONS], state[j + 5 * DIRECTIONS]
+            missing, deeper = z == none, z > high
+            nearer = (z < low) & (z != none)  # or another's
+            change = -half if nearer else (-little if missing else (-one if deeper else one))
+            total += change if on else none
+            top = on & (change == one) & (total > best)
+            ends = one if deeper & (step <= edge + four) else none
+            ends = -one if nearer else ends
+            follows = ends if on & (follows == none) else follows
+            best, edge = total if top else best, step if top else edge
+            on = on & ((edge < none) | (total >= best - four))
+            state[j], state[j + DIRECTIONS] = one if on else none, total
+            state[j + 2 * DIRECTIONS], state[j + 3 * DIRECTIONS] = best, edge
+            state[j + 4 * DIRECTIONS] = none if top else follows
+        going = none
+        for j in range(DIRECTIONS):
+            going += state[j]
+        if going == none:
             break
-    return edge if follows > 0 else -1
 
 
 @jit
 def sample_edges(
-    image: Any,
-    rank: int,
+    cut: Any,
+    rays: Singles,
     circle: Floats,
     focal: float,
     middle: float,
@@ -207,8 +150,8 @@ def sample_edges(
     """Find the depth edge of a cap in 32 directions.
 
     Args:
-        image: As in `sample_depth`.
-        rank: This circle's.
+        cut: From `own_depth`, not empty.
+        rays: (H, W, 2) rays at z = 1.
         circle: (3,) x, y, radius, px.
         focal: Focal length, px.
         middle: Middle depth of the cap, m.
@@ -218,21 +161,16 @@ def sample_edges(
     Returns:
         Number of trusted edge rays.
     """
-    depth, rays, ranks = image
-    x, y, radius = circle[0], circle[1], circle[2]
-    size = radius * middle / focal
-    gate = (middle - 0.8 * size, middle + 0.95 * size)
-    step = radius * (OUTER - INNER) / (RADII - 1)
+    size, state = circle[2] * middle / focal, np.empty(6 * DIRECTIONS, np.float32)
+    follow(cut, circle, (middle - 0.8 * size, middle + 0.95 * size), state)
     n = 0
     for j in range(DIRECTIONS):
-        dx, dy = COMPASS[j, 0], COMPASS[j, 1]
-        line = (x + INNER * radius * dx, y + INNER * radius * dy, step * dx, step * dy)
-        edge = edge_along(depth, ranks, rank, line, gate)
-        if edge < 0:
+        edge = state[j + 3 * DIRECTIONS]
+        if edge < 0.0 or state[j + 4 * DIRECTIONS] <= 0.0:
             continue
-        reach = INNER * radius + (edge + 0.5) * step + offset
-        ray = ray_at(rays, focal, x + reach * dx, y + reach * dy)
-        touch(out, n, ray, EDGE_PX * middle / focal, EDGE_SHARE)
+        reach = circle[2] * (INNER + (edge + 0.5) * STEP) + offset
+        x, y = circle[0] + reach * COMPASS[j, 0], circle[1] + reach * COMPASS[j, 1]
+        touch(out, n, ray_at(rays, focal, x, y), EDGE_PX * middle / focal, EDGE_SHARE)
         n += 1
     return n
 
@@ -245,7 +183,7 @@ def touch(out: Singles, n: int, ray: Vector, sigma: float, share: float) -> None
 
 
 @jit
-def ray_at(rays: NDArray[np.float32], focal: float, x: float, y: float) -> Vector:
+def ray_at(rays: Singles, focal: float, x: float, y: float) -> Vector:
     """Return the unit ray of a place in the image (px); outside of it, as without distortion."""
     v = min(max(int(np.floor(y + 0.5)), 0), rays.shape[0] - 1)
     u = min(max(int(np.floor(x + 0.5)), 0), rays.shape[1] - 1)

@@ -242,6 +242,21 @@ def refine(
 
 
 @jit
+def variance_of_tilt(factor: Floats) -> float:
+    """Return the variance of the tilt, rad^2, per direction, from a matrix `cholesky` factored."""
+    total, column = 0.0, np.empty(UNKNOWNS)
+    for turn in (3, 4):
+        # the diagonal of the inverse: the squared columns of that of the factor
+        for i in range(turn, UNKNOWNS):
+            value = 1.0 if i == turn else 0.0
+            for k in range(turn, i):
+                value -= factor[i, k] * column[k]
+            column[i] = value / factor[i, i]
+            total += column[i] * column[i]
+    return 0.5 * total
+
+
+@jit
 def invert(factor: Floats, out: Floats) -> None:
     """Fill the inverse (8, 8) of a matrix that `cholesky` has factored."""
     for i in range(UNKNOWNS):

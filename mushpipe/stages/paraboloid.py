@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
-from mushpipe.stages.cap_order import rank_by_depth
-from mushpipe.stages.cap_samples import CELLS, GRID, block, ray_at
+from mushpipe.stages.cap_blocks import CELLS, ENOUGH, GRID, average, middle_depth, own_depth
+from mushpipe.stages.cap_samples import ray_at
 
 Floats = NDArray[np.float64]
 COEFFICIENTS = 7
@@ -22,13 +22,14 @@ BEND = 0.3  # sigma of the quadratic coefficients about those of a cap, in radii
 ASPECT = 0.62  # height of a dome over the radius of its rim
 POINTED = 0.2  # sigma of the slope of a pointed top, less in its innermost BLUNT radii
 BLUNT = 0.15
-INNER = CELLS[(CELLS**2).sum(axis=1) < DISC**2]
+INNER = np.flatnonzero((CELLS**2).sum(axis=1) < DISC**2)
 
 
 @jit
 def fit_surfaces(
     image: Any,
     discs: Floats,
+    rank: NDArray[np.int64],
     rows: NDArray[np.intp],
     focal: float,
     noise: tuple[float, float],
@@ -40,8 +41,9 @@ def fit_surfaces(
     q = sqrt(x^2 + y^2 + BLUNT^2) - BLUNT is the tip of a pointed cap: a cone with a blunt end.
 
     Args:
-        image: Depth (H, W) m, rays (H, W, 2), and ranks (H, W) full of N.
+        image: Depth (H, W) m, missing where not above 0; rays (H, W, 2); ranks (H, W).
         discs: (N, 3) x, y, radius, px.
+        rank: (N,) of them, as `ranks` from `by_depth`.
         rows: (M,) which of them are fitted.
         focal: Focal length, px.
         noise: Sigma of depth is noise[0] + noise[1] z, m.
@@ -51,7 +53,6 @@ def fit_surfaces(
     Returns:
         (N, 2) how many points of the whole grid have depth of the cap, and how many other depth.
     """
-    rank = rank_by_depth(image[0], discs, image[2])
     near = np.empty((COEFFICIENTS + 2, len(INNER)))
     seen = np.zeros((len(discs), 2), np.int64)
     for i in rows:
@@ -82,24 +83,20 @@ def sample_inner(
         Number of points, and the middle depth (m), 0 without any.
     """
     half = max(0, int(np.floor(disc[2] / GRID)))
-    full = (2 * half + 1) ** 2
-    means, counts = np.empty((len(INNER), 4)), np.empty(len(INNER))
-    center = ray_at(image[1], focal, disc[0], disc[1])
-    n = 0
-    for j in range(len(INNER)):
-        u = int(np.floor(disc[0] + disc[2] * INNER[j, 0] + 0.5))
-        v = int(np.floor(disc[1] + disc[2] * INNER[j, 1] + 0.5))
-        counts[n] = block(image[0], image[2], rank, (u, v, half), means[n])
-        n += counts[n] > 0.4 * full
-    if n == 0:
+    means, counts = np.empty((len(CELLS), 4)), np.empty(len(CELLS))
+    average(own_depth(image[0], image[2], rank, disc, 1.0), disc, half, means, counts)
+    middle = middle_depth(means, counts, half, DISC * DISC)
+    if middle <= 0.0:
         return 0, 0.0
-    middle = float(np.median(means[:n, 2]))
+    center = ray_at(image[1], focal, disc[0], disc[1])
     size = disc[2] * middle / focal
     sigma = noise[0] + noise[1] * middle
     even = (2.5 * sigma) ** 2 + (0.6 * size * (2 * half + 1) / disc[2]) ** 2
     m = 0
-    for j in range(n):
+    for j in INNER:
         z = means[j, 2]
+        if counts[j] <= ENOUGH * (2 * half + 1) ** 2:
+            continue
         if means[j, 3] > even or not middle - 0.8 * size < z < middle + size:
             continue
         ray = ray_at(image[1], focal, means[j, 0], means[j, 1])

@@ -7,7 +7,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mushpipe import Camera, Circles, DepthSource, InputError, Locations, RgbdFrame, Stage
-from mushpipe.stages.cap_samples import ASTRAY, CELLS
+from mushpipe.stages.cap_blocks import CELLS
+from mushpipe.stages.cap_order import Order, by_depth
+from mushpipe.stages.cap_samples import ASTRAY
 from mushpipe.stages.paraboloid import ASPECT, COEFFICIENTS, SHAPE_M, TIP, fit_surfaces
 from mushpipe.stages.upright import pixel_rays
 
@@ -40,6 +42,7 @@ class SurfaceFit(Stage):
     def open(self) -> None:
         """Compile the kernels."""
         depth = np.full((48, 64), 0.4, np.float32)
+        depth.flags.writeable = False  # as a frame's, which to the compiler is a type of its own
         camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
         fit_tops(depth, camera, np.array([[32.0, 24.0, 9.0]]), (0.001, 0.001), 8)
 
@@ -56,7 +59,7 @@ class SurfaceFit(Stage):
                 "depth cannot be turned into metres without the camera's calibration: record "
                 "camera_info, or set source.camera: {fx: , fy: , cx: , cy: }"
             )
-        depth = np.fmax(frame.depth_m, np.float32(0))  # missing: 0 in place of NaN
+        depth = frame.depth_m
         discs = np.column_stack([circles.center, circles.radius])
         noise = (self.depth_noise_mm / 1000, self.depth_noise_per_m / 1000)
         surface, covariance, seen = fit_tops(depth, frame.camera, discs, noise, self.min_points)
@@ -91,24 +94,26 @@ def fit_tops(
     noise: tuple[float, float],
     least: int,
     rows: NDArray[np.intp] | None = None,
+    order: Order | None = None,
 ) -> tuple[Floats, Floats, NDArray[np.int64]]:
     """Return coefficients (N, 7), m, covariances (N, 7, 7) and numbers of points (N, 2).
 
     Args:
-        depth: (H, W) m, 0 = missing, finite.
+        depth: (H, W) m, missing where not above 0.
         camera: Intrinsics.
         discs: (N, 3) x, y, radius, px.
         noise: Sigma of depth at the camera, m, and its growth, m per m.
         least: Fewest points.
         rows: (M,) which are fitted, all unless given; the others are NaN, but hide what they cover.
+        order: From `by_depth`, if that is known.
     """
-    n = len(discs)
-    image = (depth, pixel_rays(camera), np.full(depth.shape, n, np.int16))
+    n, (rank, ranks) = len(discs), order or by_depth(depth, discs)
+    image = (depth, pixel_rays(camera), ranks)
     surface = np.full((n, COEFFICIENTS), np.nan)
     covariance = np.full((n, COEFFICIENTS, COEFFICIENTS), np.nan)
     focal = (camera.fx + camera.fy) / 2
     chosen = np.arange(n) if rows is None else rows
-    seen = fit_surfaces(image, discs, chosen, focal, noise, least, (surface, covariance))
+    seen = fit_surfaces(image, discs, rank, chosen, focal, noise, least, (surface, covariance))
     return surface, covariance, seen
 
 

@@ -167,21 +167,22 @@ def test_derivatives_agree_with_finite_differences(kind: str, bulge: float) -> N
     far = rng.uniform(0, 0.75, count) if kind == "depth" else rng.uniform(0.97, 1.03, count)
     offset = state[6] * far[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     target = state[:3] + np.column_stack([offset, np.zeros(count)])
-    points = np.zeros((4, count))
+    points = np.zeros((4, count), np.float32)
     points[3] = np.linalg.norm(target, axis=1)
     points[:3] = (target / points[3][:, None]).T
     if kind == "tangent":
         points[3] = 0  # a ray that touches
 
     def rows(at: np.ndarray) -> np.ndarray:
-        flat = np.zeros(14 * ROOM)
+        flat = np.zeros(14 * ROOM, np.float32)
         fill_rows(at, points, count, flat)
         return flat.reshape(14, ROOM)[:, :count]
 
-    base, eps = rows(state), 1e-7
+    base = rows(state)
     hit = base[9] > 0.3 if kind == "depth" else np.ones(count, bool)
     for k in range(8):
-        step = np.zeros(8)
+        # in single precision a length of 0.4 m is known to 3e-8 m
+        step, eps = np.zeros(8), 1e-3 if k in (3, 4, 7) else 5e-5  # angles and bulge, or m
         step[k] = eps
         ends = []
         for sign in (1, -1):
@@ -199,7 +200,7 @@ def test_derivatives_agree_with_finite_differences(kind: str, bulge: float) -> N
         exact = kind == "depth" and bulge == 0
         lengths = slice(0, 3) if k < 3 else slice(k, k + 1)
         scale = np.abs(base[lengths, :][:, near]).max(axis=0).mean() + 1e-9
-        assert np.abs(base[k] - change)[near].mean() < (1e-4 if exact else 0.3) * scale, k
+        assert np.abs(base[k] - change)[near].mean() < (5e-4 if exact else 0.3) * scale, k
 
 
 def test_the_covariance_matches_repeated_fits() -> None:
