@@ -19,6 +19,8 @@ from mushpipe.stages.phase_steps import height_at, rises, step_up
 
 Bytes = NDArray[np.uint8]
 
+# How bright a cap is against what is beside it is none of them: simulated beds are fuller than real
+# ones, so a cap with dark soil all around it counted as less likely than one in a cluster.
 IMAGE_FEATURES = {
     "free": "share of the outline, within the image, that nothing nearer hides",
     "support": "share of the free outline with an edge that no accepted circle has used",
@@ -31,8 +33,6 @@ IMAGE_FEATURES = {
     "oval": "departure of the outline from a circle, over the radius",
     "cover": "share of the disc that the mask covers",
     "coherence": "sum of the inward part of the gradient over the disc, over the sum of its size",
-    "contrast": "brightness just inside minus just outside, over their sum, mean over the outline",
-    "darkest": "the same where it is least, over a quarter of the outline",
     "texture": "mean gradient within 0.7 radii times the radius, over the mean brightness",
 }
 DEPTH_FEATURES = {
@@ -84,7 +84,7 @@ def disc_features(
     image: Plane, gx: Plane, gy: Plane, size: Plane, mask: Bytes, shape: Shape, rings: Table,
     row: Table,
 ) -> None:  # fmt: skip
-    """Write cover, coherence and texture of a disc, sampled on a polar grid, into row[0], [1], [4].
+    """Write cover, coherence and texture of a disc, sampled on a polar grid, into row[0..2].
 
     Samples count by the area they stand for.
     """
@@ -106,33 +106,7 @@ def disc_features(
                 small_area += t
     row[0] = set_area / max(area, 1e-9)
     row[1] = inward / max(total, 1e-9)
-    row[4] = min(4.0, small * shape[2] / max(bright, 1e-9 + 4 * small_area))
-
-
-@jit
-def contrast_features(image: Plane, shape: Shape, row: Table) -> None:
-    """Write contrast and darkest into row[2], row[3]; directions beyond the image do not count."""
-    lines, width = image.shape
-    values = np.empty(SAMPLES)
-    count, total = 0, 0.0
-    for k in range(SAMPLES):
-        c, s = _COSINES[k], _SINES[k]
-        near, far = 0.85 * shape[2] - 1, 1.08 * shape[2] + 2
-        a, b = _pixel(shape[0] + near * c, shape[1] + near * s, width, lines)
-        u, v = _pixel(shape[0] + far * c, shape[1] + far * s, width, lines)
-        if a < 0 or u < 0:
-            continue
-        inside, outside = image[b, a], image[v, u]
-        values[count] = (inside - outside) / (inside + outside + 8)
-        total += values[count]
-        count += 1
-    if count == 0:
-        row[2] = row[3] = 0
-        return
-    row[2] = total / count
-    ordered = np.sort(values[:count])
-    quarter = max(1, count // 4)
-    row[3] = ordered[:quarter].mean()
+    row[2] = min(4.0, small * shape[2] / max(bright, 1e-9 + 4 * small_area))
 
 
 @jit
@@ -249,7 +223,6 @@ def _static(
         row[first] = residual[k] / shape[2]
         row[first + 1] = math.hypot(shape[3], shape[4]) / shape[2]
         disc_features(image, gx, gy, size, mask, shape, rings, row[first + 2 :])
-        contrast_features(image, shape, row[first + 2 :])
         middle[k] = math.nan
         if len(height):
             middle[k] = surface_features(height, shape, pixel, row[depth:])
