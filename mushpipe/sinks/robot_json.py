@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from importlib.metadata import version
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Self
 
-from pydantic import Field, PrivateAttr
+from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from mushpipe import GraphPath, Picks, RunInfo, Sink, SinkPath, Trace
 from mushpipe.core.errors import EXIT_INTERRUPTED, EXIT_NO_DEVICE, EXIT_OK, UsageError
@@ -87,6 +87,26 @@ class RobotJsonSink(Sink):
     _live: bool = PrivateAttr(False)
     _warned: bool = PrivateAttr(False)
 
+    @field_validator("bind")
+    @classmethod
+    def _address(cls, value: str) -> str:
+        try:
+            ip_address(value)
+        except ValueError:
+            raise ValueError(
+                f"'{value}' is not an IP address; this computer is 127.0.0.1, all of its "
+                "networks are 0.0.0.0"
+            ) from None
+        return value
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.abb_port == self.port != 0:
+            raise ValueError(f"port and abb_port are both {self.port}: each needs its own")
+        if self.tls_cert is None and (self.tls_key or self.tls_client_ca):
+            raise ValueError("TLS needs 'tls_cert'")
+        return self
+
     def files(self, run: RunInfo) -> tuple[Path, ...]:
         """Return the transcript."""
         return (run.path(self.transcript),) if self.transcript else ()
@@ -160,8 +180,6 @@ class RobotJsonSink(Sink):
 
     def _tls(self) -> ssl.SSLContext | None:
         if self.tls_cert is None:
-            if self.tls_key or self.tls_client_ca:
-                raise UsageError("TLS needs 'tls_cert'")
             return None
         try:
             context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
@@ -222,7 +240,4 @@ class RobotJsonSink(Sink):
 
 
 def _is_loopback(address: str) -> bool:
-    try:
-        return ip_address(address).is_loopback
-    except ValueError:
-        raise UsageError(f"'bind: {address}' is not an IP address") from None
+    return ip_address(address).is_loopback

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from mushpipe import Header, RgbdFrame, RunInfo, Trace
 from mushpipe.core.errors import UsageError
@@ -83,12 +84,25 @@ def test_settings_that_cannot_be_meant(tmp_path: Path) -> None:
         ({"token_file": short}, "16 to 40 characters"),
         ({"token_file": tmp_path / "none"}, "cannot be read"),
         ({"tls_cert": short}, "TLS cannot be set up"),
-        ({"tls_client_ca": short}, "needs 'tls_cert'"),
-        ({"bind": "localhost"}, "not an IP address"),
     ]
     for chosen, text in cases:
         with pytest.raises(UsageError, match=text):
             RobotJsonSink.model_validate({"port": 0, **chosen}).open(LIVE)
+
+
+@pytest.mark.parametrize(
+    ("chosen", "text"),
+    [
+        ({"tls_client_ca": "ca.pem"}, "needs 'tls_cert'"),
+        ({"bind": "localhost"}, "'localhost' is not an IP address; this computer is 127.0.0.1"),
+        ({"port": 5005, "abb_port": 5005}, "port and abb_port are both 5005"),
+    ],
+)
+def test_settings_that_contradict_each_other_are_refused_before_the_run(
+    chosen: dict[str, Any], text: str
+) -> None:
+    with pytest.raises(ValidationError, match=text):
+        RobotJsonSink.model_validate(chosen)
 
 
 def test_with_a_token_and_tls_the_network_is_served(
