@@ -86,7 +86,7 @@ class RerunSink(Sink):
         """Open the file and the ways to viewers.
 
         Raises:
-            UsageError: Nobody listens at `connect`.
+            UsageError: Nobody listens at `connect`, or the file cannot be written.
             DependencyError: There is no display for `spawn`, or the server does not start.
         """
         import rerun as rr
@@ -98,7 +98,10 @@ class RerunSink(Sink):
             sinks.append(rr.FileSink(str(run.path(self.save)), write_footer=self.index))
         sinks += [rr.GrpcSink(url) for url in self._viewers()]
         self._recording = rr.RecordingStream("mushpipe", recording_id=run.recording)
-        self._recording.set_sinks(*sinks)
+        try:
+            self._recording.set_sinks(*sinks)
+        except RuntimeError as error:
+            raise UsageError(f"save: {self.save} cannot be written: {error}") from error
         self._memories = (Remembering(self._recording), Remembering(self._recording))
         graph = run.manifest.get("graph", {})
         self._base = _base(graph)

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from mushpipe import Trace
 from mushpipe.cli import app
-from mushpipe.core.errors import DependencyError, InputError
+from mushpipe.core.errors import DependencyError, InputError, UsageError
 from tests.io.values import make_circles, make_frame, make_picks, record, trace_of
 
 
@@ -60,3 +60,11 @@ def test_without_a_display_it_says_what_to_do(
     assert isinstance(error, DependencyError)
     assert "--save out.rrd" in str(error)
     assert "--serve 9876" in str(error)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a full device")
+def test_a_file_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    recording = record(tmp_path / "bed.mcap", [Trace(make_frame(), {}, {})])
+    result = CliRunner().invoke(app, ["view", str(recording), "--save", "/dev/full"])
+    assert isinstance(result.exception, UsageError)
+    assert "/dev/full cannot be written" in str(result.exception)
