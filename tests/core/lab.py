@@ -21,7 +21,7 @@ from mushpipe.core.report import RunReport
 from mushpipe.core.run import run
 
 WIDTH, HEIGHT = 8, 6
-PATIENCE_S = 20  # a deadlock fails a test instead of hanging it
+PATIENCE_S = 180  # a deadlock fails a test instead of hanging it; compiling kernels takes a minute
 
 
 def make_frame(sequence: int = 0, **changes: Any) -> RgbdFrame:
