@@ -88,6 +88,7 @@ def view(
 
 def _play(file: Path, sink: RerunSink, stop: threading.Event) -> None:
     from mushpipe.console import progress_bar
+    from mushpipe.core.errors import EXIT_INTERRUPTED
     from mushpipe.core.report import RunReport
     from mushpipe.core.stage import RunInfo
     from mushpipe.traces import read_manifest, read_traces
@@ -98,7 +99,7 @@ def _play(file: Path, sink: RerunSink, stop: threading.Event) -> None:
         try:
             for trace in read_traces(file):
                 if stop.is_set():
-                    return
+                    raise typer.Exit(EXIT_INTERRUPTED)
                 sink.consume(trace)
                 report.processed += 1
                 if show is not None:

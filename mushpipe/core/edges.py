@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import threading
 import time
@@ -17,6 +18,7 @@ from mushpipe.core.report import Durations, SinkReport
 from mushpipe.core.stage import ReplaySource, Source
 from mushpipe.core.types import RgbdFrame
 
+logger = logging.getLogger("mushpipe")
 READ_AHEAD = 2
 SINK_QUEUE = 4
 
@@ -27,6 +29,8 @@ def failure(node: Node, sequence: int | None, error: BaseException) -> StageErro
     known = isinstance(error, MushpipeError)
     text = str(error) if known else f"{type(error).__name__}: {error}"
     code = error.exit_code if isinstance(error, MushpipeError) else 1
+    if not known:
+        logger.debug("where %s '%s' failed:", node.kind, node.name, exc_info=error)
     return StageError(f"{node.kind} '{node.name}' ({node.use}) failed{at}: {text}", code)
 
 

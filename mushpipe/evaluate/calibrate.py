@@ -6,10 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from pydantic import ValidationError
 
 from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.tables import Floats
 from mushpipe.evaluate.plane import PlaneRow
+from mushpipe.stages.depth_correct import DepthCorrect
+
+UNEVEN_MM = 8.0  # standard deviation of depth about a plane: beyond, it is none
+LEFT_MM = 10.0  # what a correction may leave
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +58,8 @@ def fit_correction(rows: Sequence[PlaneRow], order: int) -> Correction:
         order: Of the polynomial, 0 to 2; it needs more distances than that.
 
     Raises:
-        UsageError: There are too few distances.
-        InputError: A plane has no depth.
+        UsageError: There are too few distances, or they are not those of the planes.
+        InputError: A plane has no depth, or is none.
     """
     distances = {row.distance_m for row in rows}
     if len(distances) <= order:
@@ -62,13 +67,35 @@ def fit_correction(rows: Sequence[PlaneRow], order: int) -> Correction:
     for row in rows:
         if not np.isfinite(_offset(row)):
             raise InputError(f"{row.name}: there is no depth in the middle of its images")
+        if row.values["flat_std_mm"].value > UNEVEN_MM:
+            raise InputError(
+                f"{row.name}: what is in the middle of its images is no plane, depth departs from "
+                f"one by {row.values['flat_std_mm'].value:.1f} mm (at most {UNEVEN_MM:g})"
+            )
     z = np.array([row.values["mean_mm"].value / 1e3 for row in rows])
     error = np.array([_offset(row) for row in rows])
     powers = np.vander(z, order + 1, increasing=True)
     found, *_ = np.linalg.lstsq(powers, error, rcond=None)
     coefficients = np.zeros(3)
     coefficients[: order + 1] = found
-    return Correction(coefficients, rows, error - powers @ found)
+    left = error - powers @ found
+    if np.abs(left).max() > LEFT_MM or not _taken(coefficients):
+        listed = ", ".join(f"{row.name} {_offset(row):+.1f} mm" for row in rows)
+        raise UsageError(
+            f"depth is off by {listed}: no camera's is; are the distances those of the recordings, "
+            "in their order?"
+        )
+    return Correction(coefficients, rows, left)
+
+
+def _taken(coefficients: Floats) -> bool:
+    """Return whether `depth-correct` takes such a correction."""
+    offset, slope, curve = coefficients
+    try:
+        DepthCorrect(offset_mm=offset, slope_mm_per_m=slope, curve_mm_per_m2=curve)
+    except ValidationError:
+        return False
+    return True
 
 
 def _offset(row: PlaneRow) -> float:

@@ -147,6 +147,9 @@ def _distances(text: str, recordings: int) -> list[float]:
         values = [float(part) for part in text.split(",")]
     except ValueError:
         raise UsageError(f"--plane {text}: expected metres, separated by commas") from None
-    if len(values) not in (1, recordings) or not all(0 < value < 100 for value in values):
-        raise UsageError(f"--plane {text}: expected one distance in metres, or {recordings}")
+    if not all(0 < value < 100 for value in values):
+        raise UsageError(f"--plane {text}: expected distances in metres, above 0 and below 100")
+    if len(values) not in (1, recordings):
+        each = "" if recordings == 1 else f", or {recordings}"
+        raise UsageError(f"--plane {text}: expected one distance{each}, there are {len(values)}")
     return values * recordings if len(values) == 1 else values

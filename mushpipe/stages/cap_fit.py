@@ -38,19 +38,19 @@ class CapFit(Stage):
 
     up: Up = "bed"
     tilt_deg: float = Field(
-        25, gt=0, le=90, description="spread of the tilt off the upright, degrees"
+        25.0, gt=0, le=90, description="spread of the tilt off the upright, degrees"
     )
     depth_bias_mm: float = Field(
-        0, ge=-20, le=20, description="taken off the depth; 2.85 for the SR300 of the paper"
+        0.0, ge=-20, le=20, description="taken off the depth; 2.85 for the SR300 of the paper"
     )
     depth_noise_mm: float = Field(0.3, ge=0, description="sigma of depth at the camera, mm")
     depth_noise_per_m: float = Field(1.2, ge=0, description="its growth with depth, mm per m")
     edge_offset_px: float = Field(
         0.7, ge=-3, le=3, description="how much of a cap's edge the depth camera loses, px"
     )
-    circle_sigma_px: float = Field(1, gt=0, description="sigma of the circles, px")
+    circle_sigma_px: float = Field(1.0, gt=0, description="sigma of the circles, px")
     outline_sigma_px: float = Field(
-        1, gt=0, description="sigma of the outline in the colour image, alignment included, px"
+        1.0, gt=0, description="sigma of the outline in the colour image, alignment included, px"
     )
     min_points: int = Field(8, ge=6, le=97, description="fewest of 97 points a fit needs")
 

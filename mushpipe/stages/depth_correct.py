@@ -25,9 +25,9 @@ class DepthCorrect(Stage):
     The SR300 of Baisa and Al-Diri 2022 measures 2.85 mm too far (mean of their Table I).
     """
 
-    offset_mm: float = Field(0, ge=-50, le=50, description="constant error, mm")
-    slope_mm_per_m: float = Field(0, ge=-100, le=100, description="its growth, mm per m")
-    curve_mm_per_m2: float = Field(0, ge=-100, le=100, description="its bend, mm per m^2")
+    offset_mm: float = Field(0.0, ge=-50, le=50, description="constant error, mm")
+    slope_mm_per_m: float = Field(0.0, ge=-100, le=100, description="its growth, mm per m")
+    curve_mm_per_m2: float = Field(0.0, ge=-100, le=100, description="its bend, mm per m^2")
 
     calibration: GraphPath | None = Field(
         None, description="YAML file with these three, from `mushpipe calibrate depth`"

@@ -25,7 +25,7 @@ class FuseDepth(Stage):
 
     frames: int = Field(5, ge=1, le=100, description="frames that are averaged")
     gate_mm: float = Field(
-        4, gt=0, le=100, description="step of depth at which a pixel starts anew"
+        4.0, gt=0, le=100, description="step of depth at which a pixel starts anew"
     )
     moved: float = Field(
         0.3, gt=0, le=1, description="share of pixels starting anew at which all of them do"

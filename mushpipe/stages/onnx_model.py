@@ -18,6 +18,8 @@ from mushpipe.stages.letterbox import Floats, Letterbox, letterbox
 Triple = tuple[float, float, float]
 Size = Annotated[int, Field(ge=1)]
 Spread = Annotated[float, Field(gt=0)]
+_MOST = 1000  # boxes that are looked at, the surest
+_ROUNDED = 1e-3  # how far rounding takes a score out of 0..1
 _SHAPES = {
     "logits": "(1, C, h, w) or (1, h, w)",
     "yolov5": "(1, N, 5 + C)",
@@ -111,13 +113,22 @@ class Onnx(Stage):
         return np.ascontiguousarray(values.transpose(2, 0, 1)[None], np.float32)
 
     def _mapped(self, found: NDArray[Any], box: Letterbox) -> tuple[Mask, Circles]:
+        if not np.isfinite(found).all():
+            raise UsageError(f"model {self.model}: its output has values that are no numbers")
         if self.output == "logits":
             return pieces(box.cut(probability(found, self.class_id)), self.min_score)
         boxes, score = boxes_of(found.astype(np.float64), self.output, self.class_id)
+        if len(score) and not -_ROUNDED <= score.min() <= score.max() <= 1 + _ROUNDED:
+            raise UsageError(
+                f"model {self.model}: scores are {score.min():.3g} to {score.max():.3g}, expected "
+                f"0 to 1: is its output laid out as output '{self.output}' has it, "
+                f"{_SHAPES[self.output]}?"
+            )
         order = np.flatnonzero(score >= self.min_score)
-        order = order[np.argsort(-score[order], kind="stable")]
+        order = order[np.argsort(-score[order], kind="stable")][:_MOST]
         boxes, score = box.back(boxes[order]), np.clip(score[order], 0, 1)
-        sound = (boxes[:, 2:] > 0).all(axis=1) & np.isfinite(boxes).all(axis=1)
+        inside = (boxes[:, :2] >= -0.5) & (boxes[:, :2] <= np.array(box.image) - 0.5)
+        sound = (boxes[:, 2:] > 0).all(axis=1) & inside.all(axis=1)
         circles = np.column_stack([boxes[:, :2], np.sqrt(np.abs(boxes[:, 2:]).prod(axis=1)) / 2])
         circles, score = circles[sound], score[sound]
         keep = first_of_each(circles, self.overlap)

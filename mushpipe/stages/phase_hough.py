@@ -78,11 +78,11 @@ class PhaseHough(Stage):
         "image", description="where edges are taken from; `mask` is the paper's variant, no depth"
     )
     radius_px: tuple[Positive, Positive] | None = Field(
-        (8, 38),
+        (8.0, 38.0),
         description="smallest and largest radius, px; null takes them from diameter_mm and depth",
     )
     diameter_mm: tuple[Positive, Positive] = Field(
-        (8, 120), description="smallest and largest diameter, mm, where there is depth"
+        (8.0, 120.0), description="smallest and largest diameter, mm, where there is depth"
     )
     min_score: float = Field(0.5, ge=0, le=1, description="smallest score that is kept")
     edge: float = Field(

@@ -138,6 +138,23 @@ def test_a_calibration_needs_more_distances_than_its_order(tmp_path: Path) -> No
         fit_correction([row, row], 1)
 
 
+def test_distances_that_are_not_those_of_the_planes_are_refused(tmp_path: Path) -> None:
+    files = [plane(tmp_path, 0.51, 0.003, 0.001), plane(tmp_path, 0.59, 0.003, 0.001)]
+    for text, order in (("0.59,0.51", 1), ("0.59,0.51", 0), ("0.51", 0)):
+        rows, _, _ = judge_planes(files, text, [], 0, 0)
+        with pytest.raises(UsageError, match="are the distances those of the recordings"):
+            fit_correction(rows, order)
+    for text in ("nan,0.5", "-0.51,0.59", "510,590"):
+        with pytest.raises(UsageError, match="distances in metres, above 0 and below 100"):
+            judge_planes(files, text, [], 0, 0)
+
+
+def test_a_heap_is_no_plane(tmp_path: Path) -> None:
+    row = measure_plane(plane(tmp_path, 0.51, 0.003, 0.02), 0.51, resamples=0)
+    with pytest.raises(InputError, match="is no plane, depth departs from one by 2"):
+        fit_correction([row], 0)
+
+
 def test_a_calibration_that_is_none_is_refused(tmp_path: Path) -> None:
     for text in ("offset: 3\n", "offset_mm: far\n", "calibration: x.yaml\n"):
         (tmp_path / "bad.yaml").write_text(text)

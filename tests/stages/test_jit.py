@@ -8,7 +8,12 @@ from pathlib import Path
 import pytest
 
 import mushpipe
+from mushpipe import Stage
 from mushpipe.core import jit as jitting
+from mushpipe.stages.cap_fit import CapFit
+from mushpipe.stages.depth_correct import DepthCorrect
+from mushpipe.stages.fuse_depth import FuseDepth
+from mushpipe.stages.phase_hough import PhaseHough
 
 SCRIPT = """
 import numpy as np
@@ -106,3 +111,12 @@ def test_a_broken_cache_folder_stops_nothing(tmp_path: Path) -> None:
         [sys.executable, "-c", SCRIPT], env=environment, capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stdout.strip()) == (0, "400"), done.stderr
+
+
+@pytest.mark.parametrize("stage", [CapFit, DepthCorrect, FuseDepth, PhaseHough])
+def test_defaults_are_floats_where_settings_are(stage: type[Stage]) -> None:
+    """To a kernel an int is another type: it would be compiled anew where a graph states one."""
+    for name, field in stage.model_fields.items():
+        numbers = field.default if isinstance(field.default, tuple) else (field.default,)
+        if "float" in str(field.annotation):
+            assert not any(type(number) is int for number in numbers), name

@@ -97,3 +97,25 @@ def test_what_cannot_work_is_said_with_the_file(tmp_path: Path) -> None:
         Onnx(model=boxes, output="yolov10").process(frame)
     with pytest.raises(UsageError, match=r"class_id 3 expects \(1, 4 \+ C, N\)"):
         Onnx(model=boxes, output="yolov8", class_id=3).process(frame)
+
+
+def test_an_answer_that_is_no_detection_is_refused(tmp_path: Path) -> None:
+    frame = frame_of(np.zeros((96, 96)), camera=None)
+    box = np.array([[50, 50, 30, 30, 0.9]])
+    wrong = {
+        "five": (box * [1, 1, 1, 1, 6], "scores are 5.4 to 5.4, expected 0 to 1"),
+        "none": (box * [1, 1, 1, 1, np.nan], "values that are no numbers"),
+    }
+    for name, (answer, text) in wrong.items():
+        model = answering(tmp_path / f"{name}.onnx", answer.T[None], image=[1, 3, 96, 96])
+        with pytest.raises(UsageError, match=text):
+            Onnx(model=model, output="yolov8").process(frame)
+
+
+def test_boxes_whose_middle_is_not_in_the_image_are_none(tmp_path: Path) -> None:
+    boxes = np.array([[50, 50, 30, 30, 0.9], [-500, -500, 30, 30, 0.8], [97, 50, 30, 30, 0.7]])
+    model = answering(tmp_path / "m.onnx", boxes.T[None], image=[1, 3, 96, 96])
+    _, circles = Onnx(model=model, output="yolov8").process(
+        frame_of(np.zeros((96, 96)), camera=None)
+    )
+    assert circles.score == pytest.approx([0.9])
