@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.jit import jit
+from mushpipe.core.jit import inlined, jit
 from mushpipe.stages.cap_model import Floats, Single, Singles
 
 GRID = 11
@@ -99,6 +99,12 @@ def average(
             cell += 1
 
 
+@inlined
+def enough(half: int) -> float:
+    """Return of how many valid pixels a block of a half width (px) must have more."""
+    return ENOUGH * (2 * half + 1) ** 2
+
+
 @jit
 def middle_depth(means: Floats, counts: Floats, half: int, core: float) -> float:
     """Return the median depth (m) of the blocks near the centre, 0 without any.
@@ -112,7 +118,7 @@ def middle_depth(means: Floats, counts: Floats, half: int, core: float) -> float
     values, n = np.empty(len(means)), 0
     for j in range(len(means)):
         near = CELLS[j, 0] ** 2 + CELLS[j, 1] ** 2 < core
-        if near and counts[j] > ENOUGH * (2 * half + 1) ** 2:
+        if near and counts[j] > enough(half):
             values[n] = means[j, 2]
             n += 1
     return float(np.median(values[:n])) if n else 0.0

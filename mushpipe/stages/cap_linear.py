@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mushpipe.core.jit import inlined, jit
-from mushpipe.stages.cap_model import UNKNOWNS, Floats, Singles
+from mushpipe.stages.cap_model import UNKNOWNS, Floats, Single, Singles
 
 
 @jit
@@ -99,5 +99,5 @@ def solve3(matrix: Floats, right: Floats, out: Floats) -> bool:
 @jit
 def tukey(squared: float, cut: float) -> float:
     """Return Tukey's weight of a squared, normalised residual."""
-    rest = max(1.0 - squared / cut, 0.0)
+    rest: float = max(Single(1) - squared / cut, Single(0))  # as precise as what is given
     return rest * rest

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mushpipe.core.jit import jit
-from mushpipe.stages.cap_blocks import CELLS, ENOUGH, GRID, average, middle_depth
+from mushpipe.stages.cap_blocks import CELLS, GRID, average, enough, middle_depth
 from mushpipe.stages.cap_model import Floats, Single, Singles, Vector
 
 DIRECTIONS = 32
@@ -65,7 +65,7 @@ def sample_depth(
         z = points[j, 2]
         sigma = noise[0] + noise[1] * z
         even = (2.5 * sigma) ** 2 + (0.6 * size * (2 * half + 1) / radius) ** 2
-        if count[j] <= ENOUGH * (2 * half + 1) ** 2 or points[j, 3] > even:
+        if count[j] <= enough(half) or points[j, 3] > even:
             continue
         if not middle - 0.8 * size < z < middle + size:
             other += 1

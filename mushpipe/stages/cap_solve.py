@@ -96,8 +96,7 @@ def weigh(
         variance = (outline if touches else surface) + spread * spread + missed * missed
         per_variance = Single(1) / variance
         squared, cut = residual * residual * per_variance, touch_cut if touches else far_cut
-        rest = max(Single(1) - squared / cut, none)
-        weight = rest * rest
+        weight = tukey(squared, cut)
         total += none if touches else weight
         misfit += share * min(squared, cut)
         shares += share

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
-from mushpipe.stages.cap_blocks import CELLS, ENOUGH, GRID, average, middle_depth, own_depth
+from mushpipe.stages.cap_blocks import CELLS, GRID, average, enough, middle_depth, own_depth
 from mushpipe.stages.cap_samples import ray_at
 
 Floats = NDArray[np.float64]
@@ -95,7 +95,7 @@ def sample_inner(
     m = 0
     for j in INNER:
         z = means[j, 2]
-        if counts[j] <= ENOUGH * (2 * half + 1) ** 2:
+        if counts[j] <= enough(half):
             continue
         if means[j, 3] > even or not middle - 0.8 * size < z < middle + size:
             continue
