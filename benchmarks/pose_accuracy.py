@@ -47,7 +47,8 @@ def fitted(fused: bool, **settings: float) -> Method:
         if fused:
             for one in taken:
                 frame = fuse.process(one)
-        return stage.process(frame, circles)
+        locations, poses, _ = stage.process(frame, circles)
+        return locations, poses
 
     return run
 

@@ -1,7 +1,8 @@
 """Judge `phase-hough` on simulated scenes it was not made from: `python -m training.judge`.
 
 Prints, per condition, F with and without depth and of the literal variant on the mask, beside
-OpenCV's Hough transform on the same frames and masks, and the errors of centre and radius.
+OpenCV's Hough transform on the same frames and masks, and the errors of centre and radius. `fitted`
+are the circles with depth as `cap-fit` hands them on.
 """
 
 from __future__ import annotations
@@ -10,11 +11,12 @@ import argparse
 from collections import defaultdict
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from mushpipe import Circles, Mask, RgbdFrame, Stage
+from mushpipe import Circles, Mask, RgbdFrame
+from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.hough import Hough
 from mushpipe.stages.phase_hough import PhaseHough
 from training.matching import Score, counted
@@ -22,20 +24,33 @@ from training.scenes import Case, choosing_cases, judging_cases
 from training.verifier import RADII, segmentations
 
 PAPER = (8.0, 38.0)  # px
-DETECTORS: dict[str, Stage] = {
+
+
+class Detector(Protocol):
+    """What finds circles in a mask."""
+
+    def process(self, frame: RgbdFrame, mask: Mask) -> Circles:
+        """Return the circles."""
+
+
+class Fitted:
+    """`phase-hough` with depth, its circles improved by `cap-fit`."""
+
+    def process(self, frame: RgbdFrame, mask: Mask) -> Circles:
+        """Return the improved circles."""
+        _, _, circles = CapFit().process(frame, DETECTORS["depth"].process(frame, mask))
+        return circles
+
+
+DETECTORS: dict[str, Detector] = {
     "depth": PhaseHough(radius_px=RADII),
+    "fitted": Fitted(),
     "image": PhaseHough(radius_px=RADII, use_depth=False),
     "mask": PhaseHough(radius_px=RADII, input="mask"),
     "cv-alt": Hough(radius_px=RADII),
     "cv-gradient": Hough(radius_px=RADII, method="gradient"),
     "cv-mask": Hough(radius_px=RADII, method="gradient", input="mask"),
 }
-
-
-def detect(stage: Stage, frame: RgbdFrame, mask: Mask) -> Circles:
-    """Run a detector on a frame."""
-    circles: Circles = stage.process(frame, mask)  # type: ignore[attr-defined]
-    return circles
 
 
 def judge(cases: Iterable[Case], names: list[str]) -> dict[tuple[str, str], Score]:
@@ -45,7 +60,7 @@ def judge(cases: Iterable[Case], names: list[str]) -> dict[tuple[str, str], Scor
         frame, mask = segmentations(case.frame)[0]
         counts = counted(case.truth, *RADII)
         for name in names:
-            circles = detect(DETECTORS[name], frame, mask)
+            circles = DETECTORS[name].process(frame, mask)
             scores[case.condition, name].add(circles, case.truth, counts)
     return scores
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mushpipe.core.jit import jit
 from mushpipe.stages.cap_attempt import COUNTS, ODD, POOR, fit_circle, mend, scratch
 from mushpipe.stages.cap_blocks import CELLS
+from mushpipe.stages.cap_circle import improve
 from mushpipe.stages.cap_model import (
     HEIGHT,
     RADIUS,
@@ -43,12 +44,13 @@ class Fits:
 
     Attributes:
         valid: (N,) whether there is a fit.
+        circle: (N, 3) x, y, radius, px, improved by the fit.
         center: (N, 3) m, of the rim plane.
         axis: (N, 3) unit, out of the cap.
         radius: (N,) m, of the rim.
         height: (N,) m, of the dome.
         apex: (N, 3) m.
-        surface: (N, 3) m, where the ray of the circle's centre meets the cap.
+        surface: (N, 3) m, where the ray of that circle's centre meets the cap.
         covariance: (N, 8, 8) of centre, two turns of the axis, radius, height, bulge.
         sigma_tilt: (N,) rad.
         sigma_radius: (N,) m.
@@ -60,6 +62,7 @@ class Fits:
     """
 
     valid: NDArray[np.bool_]
+    circle: Floats
     center: Floats
     axis: Floats
     radius: Floats
@@ -109,7 +112,10 @@ def second_fits(
     frame: Any, circles: Floats, upright: tuple[Floats, float], settings: Any, rays: Singles,
     out: Any,
 ) -> None:  # fmt: skip
-    """Refine every fit with what the scene says of its caps' tilt; arguments as `first_fits`."""
+    """Refine every fit with what the scene says of its caps' tilt, and then its circle, in place.
+
+    Arguments as `first_fits`.
+    """
     _, image, focal = frame
     noise = settings[0]
     caps, covariances, surfaces, counts = out
@@ -129,6 +135,8 @@ def second_fits(
         own = (upright[0], spreads[i])
         counts[i, 3], counts[i, 5] = refine(caps[i], rays[i], count, own, setting, (4, 5), work)
         invert(work[0][0], covariances[i])
+        held, doubt = (counts[i, 1], counts[i, 2]), max(1.0, counts[i, 5] / POOR)
+        improve(circles[i], caps[i], held, doubt, image[1], focal, work[1])
         ray = ray_at(image[1], focal, circles[i, 0], circles[i, 1])
         locate(caps[i], ray, covariances[i], noise.circle_px / focal, surfaces[i])
 
@@ -185,7 +193,7 @@ def fit_caps(
             and its growth (m per m), bias (m), and how much of an edge it loses (px); sigma of the
             outline in colour, px; the fewest points that make a fit.
     """
-    n = len(circles)
+    n, improved = len(circles), circles.copy()
     gray, image, focal = frame
     out = (
         np.full((n, SIZE), np.nan),
@@ -197,11 +205,18 @@ def fit_caps(
     rank, ranks = order
     ranked = (gray, (*image, ranks), focal)
     first_fits(ranked, circles, rank, upright, settings, rays, out)
-    second_fits(ranked, circles, upright, settings, rays, out)
-    return _fits(*out)
+    second_fits(ranked, improved, upright, settings, rays, out)
+    return _fits(circles, improved, *out)
 
 
-def _fits(caps: Floats, covariances: Floats, surfaces: Floats, counts: Floats) -> Fits:
+def _fits(
+    circles: Floats,
+    improved: Floats,
+    caps: Floats,
+    covariances: Floats,
+    surfaces: Floats,
+    counts: Floats,
+) -> Fits:
     finite = np.isfinite(caps).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
     valid = (counts[:, 0] > 0) & (counts[:, 3] >= 0) & finite & np.isfinite(surfaces).all(axis=1)
     for array in (caps, covariances, surfaces):
@@ -213,6 +228,7 @@ def _fits(caps: Floats, covariances: Floats, surfaces: Floats, counts: Floats) -
     center, axis = caps[:, :3], caps[:, N : N + 3]
     return Fits(
         valid,
+        np.where(valid[:, None], improved, circles),
         center,
         axis,
         caps[:, RADIUS],

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
@@ -34,6 +36,8 @@ class CapFit(Stage):
     the circle, which touch the cap; and to what caps are like. Nearer mushrooms' circles hide what
     they cover. Over a hole at the centre the position is that of `surface-fit`. Where tilt cannot
     be seen the sigma says so. A mushroom with hardly any depth is ``missing`` and has no pose.
+    Circles are handed on improved: drawn to the outline of the fitted cap where the image shows
+    little of it.
     """
 
     up: Up = "bed"
@@ -65,14 +69,14 @@ class CapFit(Stage):
         fits = self.fit(gray, depth, camera, circles, order)
         self._bridge(np.arange(1), fits, depth, camera, circles, order)
 
-    def process(self, frame: RgbdFrame, circles: Circles) -> tuple[Locations, Poses]:
-        """Return one location and one pose per circle.
+    def process(self, frame: RgbdFrame, circles: Circles) -> tuple[Locations, Poses, Circles]:
+        """Return one location and one pose per circle, and the circles, improved.
 
         Raises:
             InputError: The frame has depth but no calibration.
         """
         if frame.depth is None or not len(circles):
-            return Locations.unknown(len(circles)), Poses.unknown(len(circles))
+            return Locations.unknown(len(circles)), Poses.unknown(len(circles)), circles
         if frame.camera is None:
             raise InputError(
                 "depth cannot be turned into metres without the camera's calibration: record "
@@ -81,11 +85,12 @@ class CapFit(Stage):
         depth = frame.depth_m
         order = by_depth(depth, _discs(circles))
         fits = self.fit(frame.gray, depth, frame.camera, circles, order)
+        circles = replace(circles, center=fits.circle[:, :2], radius=fits.circle[:, 2])
         source = np.where(fits.valid, sources(circles, depth), DepthSource.MISSING)
         holes = np.flatnonzero(source == DepthSource.NEIGHBOURS)
         if len(holes):
             self._bridge(holes, fits, depth, frame.camera, circles, order)
-        return _locations(fits, source.astype(np.uint8)), _poses(fits)
+        return _locations(fits, source.astype(np.uint8)), _poses(fits), circles
 
     def fit(
         self,

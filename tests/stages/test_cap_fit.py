@@ -31,7 +31,7 @@ def angle(a: np.ndarray, b: np.ndarray) -> float:
 def fit(caps: list[Cap], **more: object) -> tuple[Locations, Poses]:
     depth, gray = draw(caps, 0.44)
     stage = CapFit.model_validate({**EXACT, "up": "camera", **more})
-    return stage.process(frame_from(depth, gray), circles_of(caps))
+    return stage.process(frame_from(depth, gray), circles_of(caps))[:2]
 
 
 @settings(max_examples=25, deadline=None)
@@ -50,7 +50,8 @@ def test_an_exact_cap_is_recovered_wherever_it_is_and_however_it_leans(
     locations, poses = fit([true])
     assert poses.valid[0]
     assert angle(poses.axis[0], true.axis) < 1.5
-    assert locations.diameter[0] == pytest.approx(2 * radius, abs=4e-4)
+    # half a pixel: the depth that is drawn ends at whole ones, all around a centred cap alike
+    assert locations.diameter[0] == pytest.approx(2 * radius, abs=5e-4)
     assert np.linalg.norm(poses.apex[0] - true.apex) < 8e-4
     depth, _ = draw([true], 0.44)
     u, v = np.rint(circles_of([true]).center[0]).astype(int)
@@ -75,14 +76,14 @@ def test_the_whole_scene_turned_in_the_image_turns_the_answer() -> None:
     depth, gray = draw(caps, 0.44, square)
     stage = CapFit.model_validate({**EXACT, "up": "camera"})
     circles = circles_of(caps, square)
-    _, straight = stage.process(frame_from(depth, gray, square), circles)
+    _, straight, _ = stage.process(frame_from(depth, gray, square), circles)
     # a quarter turn maps (x, y) to (-y, x); the centre of the image stays
     turned = Circles(
         np.stack([240 - circles.center[:, 1], circles.center[:, 0]], axis=1),
         circles.radius,
         circles.score,
     )
-    _, side = stage.process(
+    _, side, _ = stage.process(
         frame_from(np.rot90(depth, -1).copy(), np.rot90(gray, -1).copy(), square), turned
     )
     x, y, z = straight.axis[0]
@@ -104,7 +105,7 @@ def test_a_high_pointed_cap_that_leans_is_not_taken_for_a_small_upright_one(powe
     depth, gray = draw_pointed(true, power, 0.45)
     x, y, radius = circle_around(depth < 0.45)
     stage = CapFit(up="camera", edge_offset_px=0)
-    locations, poses = stage.process(frame_from(depth, gray), Circles([[x, y]], [radius], [1.0]))
+    locations, poses, _ = stage.process(frame_from(depth, gray), Circles([[x, y]], [radius], [1.0]))
     assert angle(poses.axis[0], true.axis) < 3
     assert locations.diameter[0] == pytest.approx(0.044, abs=2e-3)
 
@@ -113,9 +114,9 @@ def test_an_outline_that_no_depth_edge_confirms_widens_the_sigmas() -> None:
     true = cap(15, 60, (0, 0, 0.4), 0.022, 0.55)
     depth, gray = draw([true], 0.44)
     stage, circles = CapFit(up="camera"), circles_of([true])
-    with_edges, seen = stage.process(frame_from(depth, gray), circles)
+    with_edges, seen, _ = stage.process(frame_from(depth, gray), circles)
     alone = np.where(depth < 0.44, depth, np.nan)
-    without, guessed = stage.process(frame_from(alone, gray), circles)
+    without, guessed, _ = stage.process(frame_from(alone, gray), circles)
     assert without.sigma_diameter[0] > 2 * with_edges.sigma_diameter[0]
     assert guessed.sigma_rad[0] > 1.5 * seen.sigma_rad[0]
 
@@ -135,7 +136,7 @@ def test_a_constant_error_of_depth_is_taken_off() -> None:
     true = cap(20, 40, (0, 0, 0.4), 0.02, 0.6)
     depth, gray = draw([true], 0.44)
     stage = CapFit.model_validate({**EXACT, "up": "camera", "depth_bias_mm": 2.85})
-    _, poses = stage.process(frame_from(depth + 0.00285, gray), circles_of([true]))
+    _, poses, _ = stage.process(frame_from(depth + 0.00285, gray), circles_of([true]))
     assert np.linalg.norm(poses.apex[0] - true.apex) < 8e-4
 
 
@@ -144,7 +145,7 @@ def test_a_lens_with_distortion_is_followed() -> None:
     true = cap(20, 130, (-0.09, 0.06, 0.4), 0.022, 0.6)
     depth, gray = draw([true], 0.44, bent)
     stage = CapFit.model_validate({**EXACT, "up": "camera"})
-    locations, poses = stage.process(frame_from(depth, gray, bent), circles_of([true], bent))
+    locations, poses, _ = stage.process(frame_from(depth, gray, bent), circles_of([true], bent))
     assert angle(poses.axis[0], true.axis) < 2
     assert np.linalg.norm(poses.apex[0] - true.apex) < 8e-4
     assert locations.diameter[0] == pytest.approx(0.044, abs=4e-4)
@@ -216,7 +217,7 @@ def test_the_covariance_matches_repeated_fits() -> None:
         circles = Circles(
             clean.center + rng.normal(0, 1.5, (1, 2)), clean.radius + rng.normal(0, 1.0, 1), [1.0]
         )
-        locations, poses = stage.process(frame_from(noisy, gray), circles)
+        locations, poses, _ = stage.process(frame_from(noisy, gray), circles)
         axes.append(poses.axis[0])
         radii.append(locations.diameter[0])
         sigma_tilt.append(poses.sigma_rad[0])

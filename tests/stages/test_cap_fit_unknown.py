@@ -24,7 +24,9 @@ def missing(depth: np.ndarray | None, circles: Circles = ONE) -> None:
     frame = frame_from(np.zeros((240, 320)) if depth is None else depth, gray)
     if depth is None:
         frame = RgbdFrame(frame.header, frame.color, None, 1.0, CAMERA)
-    locations, poses = CapFit().process(frame, circles)
+    locations, poses, same = CapFit().process(frame, circles)
+    assert np.array_equal(same.center, circles.center)
+    assert np.array_equal(same.radius, circles.radius)
     assert locations.source.tolist() == [DepthSource.MISSING] * len(circles)
     assert np.isnan(locations.position).all()
     assert np.isnan(locations.diameter).all()
@@ -67,7 +69,7 @@ def test_infinite_depth_is_missing_depth() -> None:
         1.0,
         CAMERA,
     )
-    locations, _ = CapFit().process(frame, ONE)
+    locations, *_ = CapFit().process(frame, ONE)
     assert locations.source[0] == DepthSource.MISSING
 
 
@@ -95,9 +97,9 @@ def test_a_cap_that_does_not_fit_the_model_says_so_in_its_sigmas() -> None:
     v, u = np.mgrid[:240, :320]
     knobs = 0.003 * np.sin(u / 5) * np.sin(v / 5)
     stage, circles = CapFit(up="camera"), circles_of([true])
-    locations, poses = stage.process(frame_from(depth, gray), circles)
+    locations, poses, _ = stage.process(frame_from(depth, gray), circles)
     lumpy = np.where(depth < 0.44, depth + knobs, depth)
-    others, lumps = stage.process(frame_from(lumpy, gray), circles)
+    others, lumps, _ = stage.process(frame_from(lumpy, gray), circles)
     assert lumps.sigma_rad[0] > 1.3 * poses.sigma_rad[0]
     assert others.sigma_diameter[0] > 1.2 * locations.sigma_diameter[0]
     assert angle(lumps.axis[0], true.axis) < 3 * np.degrees(lumps.sigma_rad[0])

@@ -74,7 +74,7 @@ def test_a_cap_is_found_in_a_circle_that_is_off(wrong: tuple[float, float, float
     depth, gray = draw([LOW], BED)
     circles = circles_of([LOW])
     shifted = Circles(circles.center + wrong[:2], circles.radius * wrong[2], circles.score)
-    locations, poses = CapFit(up="camera", edge_offset_px=0).process(
+    locations, poses, _ = CapFit(up="camera", edge_offset_px=0).process(
         frame_from(depth, gray), shifted
     )
     assert poses.axis[0] @ LOW.axis > np.cos(np.radians(3))
