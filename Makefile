@@ -54,10 +54,11 @@ unit: $(STAMP)-dev
 test-slow: $(STAMP)-dev system-libraries
 	$(BIN)/pytest -m slow
 
-# Weights of the detector's verifier, from simulated scenes alone; rendering takes minutes.
+# Weights of the verifiers of detector and cap fit, from simulated scenes alone; rendering takes minutes.
 .PHONY: verifier
 verifier: $(STAMP) system-libraries
 	$(BIN)/python -m training.verifier
+	$(BIN)/python -m training.fitted
 
 # The network of `cap-net`, from nothing: frames, the one that ships, figures; `train-seeds` adds the
 # two that tell how much chance there is. A training gains nothing from a second core, so those run

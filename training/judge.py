@@ -2,7 +2,7 @@
 
 Prints, per condition, F with and without depth and of the literal variant on the mask, beside
 OpenCV's Hough transform on the same frames and masks, and the errors of centre and radius. `fitted`
-are the circles with depth as `cap-fit` hands them on.
+is the detector with depth and `cap-fit` after it, as in graphs/classic.yaml.
 """
 
 from __future__ import annotations
@@ -34,11 +34,13 @@ class Detector(Protocol):
 
 
 class Fitted:
-    """`phase-hough` with depth, its circles improved by `cap-fit`."""
+    """`phase-hough` with depth down to a low score, and `cap-fit`, which decides and improves."""
+
+    _detect, _fit = PhaseHough(radius_px=RADII, min_score=0.2), CapFit(min_score=0.5)
 
     def process(self, frame: RgbdFrame, mask: Mask) -> Circles:
-        """Return the improved circles."""
-        _, _, circles = CapFit().process(frame, DETECTORS["depth"].process(frame, mask))
+        """Return the circles that stay, improved."""
+        _, _, circles = self._fit.process(frame, self._detect.process(frame, mask))
         return circles
 
 

@@ -25,7 +25,6 @@ from mushpipe.stages.chan_vese import ChanVese
 from mushpipe.stages.flatten import Flatten
 from mushpipe.stages.opening import Opening
 from mushpipe.stages.otsu import Otsu
-from mushpipe.stages.phase_decide import LIMIT
 from mushpipe.stages.phase_features import (
     DEPTH_FEATURES,
     IMAGE_FEATURES,
@@ -34,7 +33,7 @@ from mushpipe.stages.phase_features import (
     kinds,
 )
 from mushpipe.stages.phase_hough import PhaseHough, equal_area_radius
-from mushpipe.stages.verifier import COLUMNS
+from mushpipe.stages.verifier import COLUMNS, LIMIT
 from training.matching import IOU
 from training.net.scenes import varied_cases
 from training.scenes import Case, training_cases
@@ -159,16 +158,24 @@ def samples(stage: PhaseHough, cases: Iterable[Prepared], kind: int) -> tuple[Fl
     return np.concatenate(rows), np.concatenate(right)
 
 
-def fit(features: Floats, right: Floats, names: tuple[str, ...], ridge: float) -> dict[str, Any]:
-    """Return a model: logistic regression on standardised features and their squares.
+def fit(
+    features: Floats,
+    right: Floats,
+    names: tuple[str, ...],
+    ridge: float,
+    squared: tuple[str, ...],
+) -> dict[str, Any]:
+    """Return a model: logistic regression on standardised features (N, F) and the squares of some.
 
     The ridge (per sample) keeps weights small; without class weights the probability is calibrated
     on the scenes of the training.
     """
-    x = features[:, [NAMES.index(name) for name in names]]
-    mean, scale = x.mean(axis=0), np.maximum(x.std(axis=0), 1e-3)
-    z = np.clip((x - mean) / scale, -LIMIT, LIMIT)
+    mean, scale = features.mean(axis=0), np.maximum(features.std(axis=0), 1e-3)
+    z = np.clip((features - mean) / scale, -LIMIT, LIMIT)
     basis = np.column_stack([np.ones(len(z)), z, z * z])
+    basis[:, 1 + len(names) :] *= [
+        name in (names if squared is None else squared) for name in names
+    ]
 
     def loss(w: Floats) -> tuple[float, Floats]:
         logit = basis @ w
@@ -191,9 +198,9 @@ def first_guess() -> dict[str, Any]:
     return {"intercept": 0.0, "features": features}
 
 
-def write(models: dict[str, Any], path: Path) -> None:
-    """Write the file of the verifier."""
-    lines = [HEAD + "models:"]
+def write(models: dict[str, Any], path: Path, head: str = HEAD) -> None:
+    """Write the file of a verifier."""
+    lines = [head + "models:"]
     for name, model in models.items():
         lines += [f"  {name}:", f"    intercept: {model['intercept']}", "    features:"]
         for feature, values in model["features"].items():
@@ -216,7 +223,8 @@ def train(cache: Path, out: Path, rounds: int, ridge: float, names: list[str]) -
             chosen = [case for case in cases if (case[3] is not None) == beside]
             kind = KINDS.get(name.removesuffix("_learned"), 0)
             features, right = samples(stage, chosen, kind)
-            models[name] = fit(features, right, FEATURES[name], ridge)
+            columns = [NAMES.index(feature) for feature in FEATURES[name]]
+            models[name] = fit(features[:, columns], right, FEATURES[name], ridge, NAMES)
             print(f"round {turn + 1}, {name}: {len(right)} candidates, {right.mean():.2f} right")
         write(models, out)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
@@ -22,6 +20,7 @@ from mushpipe import (
 from mushpipe.stages.cap_batch import Fits, fit_caps
 from mushpipe.stages.cap_order import Order, by_depth
 from mushpipe.stages.cap_solve import Noise
+from mushpipe.stages.cap_verify import chances
 from mushpipe.stages.surface_fit import fit_tops, sources, variance_along, without_tip
 from mushpipe.stages.upright import Up, pixel_rays, upright
 
@@ -37,7 +36,7 @@ class CapFit(Stage):
     they cover. Over a hole at the centre the position is that of `surface-fit`. Where tilt cannot
     be seen the sigma says so. A mushroom with hardly any depth is ``missing`` and has no pose.
     Circles are handed on improved: drawn to the outline of the fitted cap where the image shows
-    little of it.
+    little of it. With `min_score` the fit decides, too, which of them are caps.
     """
 
     up: Up = "bed"
@@ -57,6 +56,13 @@ class CapFit(Stage):
         1.0, gt=0, description="sigma of the outline in the colour image, alignment included, px"
     )
     min_points: int = Field(8, ge=6, le=97, description="fewest of 97 points a fit needs")
+    min_score: float | None = Field(
+        None,
+        ge=0,
+        le=1,
+        description="renew the scores of phase-hough by what the fits tell, and leave out circles "
+        "below this one; null keeps all, with their scores",
+    )
 
     def open(self) -> None:
         """Compile the kernels."""
@@ -70,13 +76,13 @@ class CapFit(Stage):
         self._bridge(np.arange(1), fits, depth, camera, circles, order)
 
     def process(self, frame: RgbdFrame, circles: Circles) -> tuple[Locations, Poses, Circles]:
-        """Return one location and one pose per circle, and the circles, improved.
+        """Return the circles, improved, and one location and one pose for each.
 
         Raises:
             InputError: The frame has depth but no calibration.
         """
         if frame.depth is None or not len(circles):
-            return Locations.unknown(len(circles)), Poses.unknown(len(circles)), circles
+            return self._kept(Locations.unknown(len(circles)), Poses.unknown(len(circles)), circles)
         if frame.camera is None:
             raise InputError(
                 "depth cannot be turned into metres without the camera's calibration: record "
@@ -85,12 +91,21 @@ class CapFit(Stage):
         depth = frame.depth_m
         order = by_depth(depth, _discs(circles))
         fits = self.fit(frame.gray, depth, frame.camera, circles, order)
-        circles = replace(circles, center=fits.circle[:, :2], radius=fits.circle[:, 2])
+        score = circles.score if self.min_score is None else chances(circles, fits)
+        circles = Circles(fits.circle[:, :2], fits.circle[:, 2], score)
         source = np.where(fits.valid, sources(circles, depth), DepthSource.MISSING)
         holes = np.flatnonzero(source == DepthSource.NEIGHBOURS)
         if len(holes):
             self._bridge(holes, fits, depth, frame.camera, circles, order)
-        return _locations(fits, source.astype(np.uint8)), _poses(fits), circles
+        return self._kept(_locations(fits, source.astype(np.uint8)), _poses(fits), circles)
+
+    def _kept(
+        self, locations: Locations, poses: Poses, circles: Circles
+    ) -> tuple[Locations, Poses, Circles]:
+        if self.min_score is None:
+            return locations, poses, circles
+        rows = np.flatnonzero(circles.score >= self.min_score)
+        return locations.take(rows), poses.take(rows), circles.take(rows)
 
     def fit(
         self,

@@ -25,11 +25,11 @@ from mushpipe.stages.phase_refit import (
     tolerance,
 )
 from mushpipe.stages.phase_strips import Strips
+from mushpipe.stages.verifier import LIMIT
 
 MARGIN = 1.0  # px; so far within an accepted circle an outline counts as hidden by it
 SHADE = 3.0  # px; so far around an accepted circle, a lower one is shaded
 HOPELESS = 2e-5  # probability from which on nothing that is accepted later can help
-LIMIT = 2.5  # of a standardised feature: beyond the scenes of the training it says no more
 OWN = 24  # edge points with which an outline is fitted to what is its own
 TAKEN = 2.5  # px; edges so near an accepted outline are its own
 

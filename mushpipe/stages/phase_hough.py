@@ -27,8 +27,8 @@ from mushpipe.stages.phase_fuse import fused
 from mushpipe.stages.phase_learned import add_discs, agreement, candidates_of
 from mushpipe.stages.phase_refit import Table, refit
 from mushpipe.stages.phase_strips import Strips, in_strips
+from mushpipe.stages.phase_verifier import load_verifier
 from mushpipe.stages.phase_votes import CELL, peaks, rings_between, summed, vote
-from mushpipe.stages.verifier import load_verifier
 
 Positive = Annotated[float, Field(gt=0)]
 Bytes = NDArray[np.uint8]

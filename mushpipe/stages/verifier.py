@@ -1,79 +1,73 @@
-"""The verifier: logistic models over named features, read from a file of the package.
+"""Verifiers: logistic models over named features, read from files.
 
-`training/verifier.py` makes the file from the simulator alone.
+`training/verifier.py` and `training/fitted.py` make those of the package from the simulator alone.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
-from mushpipe.stages.phase_features import NAMES
-from mushpipe.stages.phase_refit import Table
+from mushpipe.core.errors import UsageError
 
-FILE = "verifier.yaml"
+Floats = NDArray[np.float64]
 COLUMNS = ("mean", "scale", "weight", "square")
+LIMIT = 2.5  # of a standardised feature: beyond the scenes of the training it says no more
+_EXPECTED = "expected a file as `make verifier` writes it"
 
 
-@dataclass(frozen=True, eq=False)
-class Verifier:
-    """Weights of models, each (F + 1, 4).
-
-    ``image`` and ``mask`` are for candidates without depth, ``depth`` for those with, ``low`` for
-    those that hardly stand out from the bed; ``.._learned`` beside another detector's circles.
-
-    Row k holds mean, scale, weight and weight of the square of feature k, the last row the
-    intercept as its weight. A feature that a model does not name has no weight in it.
-    """
-
-    image: Table
-    depth: Table
-    low: Table
-    mask: Table
-    image_learned: Table
-    depth_learned: Table
-    low_learned: Table
-
-    def stacked(self, literal: bool) -> Table:
-        """Return (6, F + 1, 4): without depth, with, low, then beside another detector.
-
-        `literal` is for edges of the mask, whose candidates have no depth.
-        """
-        alone = (self.mask if literal else self.image, self.depth, self.low)
-        return np.stack([*alone, self.image_learned, self.depth_learned, self.low_learned])
+def package_file(name: str) -> Path:
+    """Return a file of weights that comes with the package."""
+    with resources.as_file(resources.files("mushpipe.stages") / name) as path:
+        return path
 
 
-def load_verifier(path: Path | None = None) -> Verifier:
-    """Read a verifier from a file, by default the package's own.
+def read_models(path: Path, names: Sequence[str], features: Sequence[str]) -> dict[str, Floats]:
+    """Return the weights (F + 1, 4) of models, as `weights_of`, by their names.
 
     Raises:
-        ValueError: The file names a feature that does not exist, or lacks a model.
+        UsageError: There is no such file, it lacks a model, or a model is not over these features.
     """
-    text = (path or resources.files("mushpipe.stages") / FILE).read_text(encoding="utf-8")
-    content = yaml.safe_load(text)
-    missing = {field.name for field in fields(Verifier)} - set(content["models"])
-    if missing:
-        raise ValueError(f"the verifier lacks the models {sorted(missing)}")
-    return Verifier(**{name: weights_of(model) for name, model in content["models"].items()})
+    try:
+        models = yaml.safe_load(path.read_text(encoding="utf-8"))["models"]
+        return {name: weights_of(models[name], features) for name in names}
+    except OSError as error:
+        raise UsageError(f"verifier {path}: {error.strerror}") from error
+    except KeyError as error:
+        raise UsageError(f"verifier {path}: it lacks {error}; {_EXPECTED}") from error
+    except (yaml.YAMLError, TypeError, ValueError) as error:
+        raise UsageError(f"verifier {path}: {error}; {_EXPECTED}") from error
 
 
-def weights_of(model: dict[str, Any]) -> Table:
-    """Return the weights of a model as it stands in the file.
+def weights_of(model: dict[str, Any], features: Sequence[str]) -> Floats:
+    """Return the weights (F + 1, 4) of a model as it stands in the file.
+
+    Row k holds mean, scale, weight and weight of the square of feature k, the last row the
+    intercept as its weight. A feature that the model does not name has no weight in it.
 
     Raises:
         ValueError: It names a feature that does not exist.
+        KeyError: It lacks a number.
     """
-    unknown = set(model["features"]) - set(NAMES)
+    unknown = set(model["features"]) - set(features)
     if unknown:
-        raise ValueError(f"the verifier names unknown features {sorted(unknown)}")
-    weights = np.zeros((len(NAMES) + 1, len(COLUMNS)))
+        raise ValueError(f"unknown features {sorted(unknown)}")
+    weights = np.zeros((len(features) + 1, len(COLUMNS)))
     weights[:, 1] = 1
     for name, values in model["features"].items():
-        weights[NAMES.index(name)] = [values[column] for column in COLUMNS]
+        weights[features.index(name)] = [values[column] for column in COLUMNS]
     weights[-1, 2] = model["intercept"]
     return weights
+
+
+def probability(table: Floats, weights: Floats) -> Floats:
+    """Return the probabilities (N,) of rows of features (N, F)."""
+    mean, scale, weight, square = weights[:-1].T
+    z = np.clip((table - mean) / scale, -LIMIT, LIMIT)
+    return np.asarray(1 / (1 + np.exp(-(weights[-1, 2] + z @ weight + (z * z) @ square))))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mushpipe import Mask
+from mushpipe.core.errors import UsageError
 from mushpipe.stages.bed import far_cells, fit_plane, plane_depth
 from mushpipe.stages.phase_decide import lens, outline_features, overlap_features, probability
 from mushpipe.stages.phase_depth import GRID, closed, halved, relief_of
@@ -22,8 +23,9 @@ from mushpipe.stages.phase_features import (
 from mushpipe.stages.phase_hough import PhaseHough, equal_area_radius
 from mushpipe.stages.phase_refit import DIRECTIONS, HIDDEN, directions_of
 from mushpipe.stages.phase_strips import Strips, in_strips
+from mushpipe.stages.phase_verifier import Verifier, load_verifier
 from mushpipe.stages.phase_votes import GAP, peaks, phase_of, rings_between, summed, vote
-from mushpipe.stages.verifier import Verifier, load_verifier, weights_of
+from mushpipe.stages.verifier import weights_of
 from tests.stages.scenes import discs, frame_of, sphere_depth
 
 ALL = np.ones((120, 160), np.uint8)
@@ -242,7 +244,7 @@ def test_the_probability_is_the_logistic_of_the_weighted_features() -> None:
     row = np.zeros(len(NAMES))
     row[NAMES.index("support")] = 0.75
     logit = -0.5 + 1.0 * 1 - 0.2 * 1
-    assert probability(row, weights_of(model)) == pytest.approx(1 / (1 + math.exp(-logit)))
+    assert probability(row, weights_of(model, NAMES)) == pytest.approx(1 / (1 + math.exp(-logit)))
 
 
 def test_the_verifier_of_the_package_names_known_features_only() -> None:
@@ -268,11 +270,18 @@ def test_a_verifier_with_an_unknown_feature_is_refused(tmp_path: Path) -> None:
     model = "{intercept: 0, features: {luck: {mean: 0, scale: 1, weight: 1, square: 0}}}"
     names = [field.name for field in fields(Verifier)]
     path.write_text(f"models: {{{', '.join(f'{name}: {model}' for name in names)}}}")
-    with pytest.raises(ValueError, match="unknown features"):
+    with pytest.raises(UsageError, match=r"unknown features \['luck'\]"):
         load_verifier(path)
-    path.write_text("models: {}")
-    with pytest.raises(ValueError, match="lacks the models"):
+
+
+@pytest.mark.parametrize("text", ["models: {}", "foo: 1", "", "[1, 2", "models: 3", "a: \xff"])
+def test_a_file_that_is_no_verifier_is_refused(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(UsageError, match=r"mine\.yaml: .*; expected a file as `make verifier`"):
         load_verifier(path)
+    with pytest.raises(UsageError, match=r"none\.yaml: No such file"):
+        load_verifier(tmp_path / "none.yaml")
 
 
 def test_every_candidate_has_all_features_and_a_probability() -> None:

@@ -1,0 +1,59 @@
+"""Whether a fitted circle is a cap: a logistic regression over what the fit found.
+
+A detector decides before anything is fitted. How well a spheroid fits, how surely it leans as it
+does, whether its form is a cap's and its place the circle's says more: stones, stems, paper and
+parts of caps seldom fit. The weights stand in `fitted.yaml`; `training/fitted.py` makes them.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mushpipe import Circles
+from mushpipe.stages.cap_batch import Fits
+from mushpipe.stages.verifier import package_file, probability, read_models
+
+Floats = NDArray[np.float64]
+MODEL = "fitted"
+FILE = f"{MODEL}.yaml"
+NAMES = ("score", "misfit", "tilt", "aspect", "moved")
+
+
+def features(circles: Circles, fits: Fits) -> Floats:
+    """Return the features (N, F) in the order of `NAMES`; NaN where nothing was fitted.
+
+    Logit of the score; log of the misfit over the median in view, since what fits how well depends
+    on the sensor; log of the sigma of the tilt, rad; height over radius; how far the fit moves the
+    circle, in its radii.
+    """
+    score = np.clip(circles.score, 1e-4, 1 - 1e-4)
+    usual = np.median(fits.misfit[fits.valid]) if fits.valid.any() else 1.0
+    table = np.column_stack(
+        [
+            np.log(score / (1 - score)),
+            np.log(np.clip(fits.misfit / usual, 0.1, 10)),
+            np.log(np.clip(fits.sigma_tilt, 0.02, 3)),
+            np.clip(fits.height / fits.radius, 0.2, 1.5),
+            np.linalg.norm(fits.circle[:, :2] - circles.center, axis=1) / circles.radius,
+        ]
+    )
+    table[~fits.valid] = np.nan
+    return table
+
+
+def chances(circles: Circles, fits: Fits) -> Floats:
+    """Return the probability (N,) of each circle to be a cap; its score where nothing was fitted.
+
+    Args:
+        circles: As detected, with the scores of `phase-hough`.
+        fits: Of these circles.
+    """
+    return np.where(fits.valid, probability(features(circles, fits), _weights()), circles.score)
+
+
+@lru_cache(maxsize=1)
+def _weights() -> Floats:
+    return read_models(package_file(FILE), [MODEL], NAMES)[MODEL]

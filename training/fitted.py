@@ -1,0 +1,91 @@
+"""Make the verifier of `cap-fit` from simulated scenes: `python -m training.fitted`.
+
+Circles of `phase-hough`, alone and beside `cap-net`, down to a low score, are fitted, in depth as
+it was simulated and in worse, and labelled by the simulator's truth.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from mushpipe import Circles, RgbdFrame
+from mushpipe.core.truth import Truth
+from mushpipe.evaluate.matching import circle_iou
+from mushpipe.stages.cap_fit import CapFit
+from mushpipe.stages.cap_verify import MODEL, NAMES, features
+from mushpipe.stages.phase_hough import PhaseHough
+from training.matching import IOU, counted
+from training.net.scenes import varied_cases
+from training.scenes import training_cases
+from training.sensors import worse
+from training.verifier import NET, RADII, VARIED, Floats, fit, segmentations, write
+
+LEAST = 0.1  # score
+SQUARED = ("aspect",)  # a cap is neither flat nor a ball; of the others more is better, or less
+NEUTRAL = 0.3  # IoU with a mushroom that need not be found, from which on a circle teaches nothing
+ALONE = PhaseHough(radius_px=RADII, min_score=LEAST)
+BESIDE = PhaseHough(radius_px=RADII, min_score=LEAST, use_learned=True)
+HEAD = """\
+# The verifier of the stage `cap-fit`: a logistic regression over what the fit found, made by
+# `make verifier` from simulated scenes alone. A feature x (docs/detection.md says what each is)
+# adds  weight z + square z^2  to the logit, with z = (x - mean) / scale, clipped to -2.5..2.5.
+"""
+
+
+def detected(frame: RgbdFrame) -> Iterator[Circles]:
+    """Yield the circles of the detector alone, and beside the network."""
+    yield ALONE.process(*segmentations(frame)[0])
+    yield BESIDE.process(frame, *NET.process(frame))
+
+
+def labels(circles: Circles, truth: Truth) -> Floats:
+    """Return 1 for circles (N,) that are a cap's, 0 for others, NaN for those that do not count."""
+    counts = counted(truth, *RADII)
+    iou = circle_iou(circles.center, circles.radius, truth.center, truth.radius)
+    rows, columns = linear_sum_assignment(np.where(iou[:, counts] >= IOU, -iou[:, counts], 1.0))
+    right = np.zeros(len(circles), bool)
+    right[rows] = iou[:, counts][rows, columns] >= IOU
+    neutral = ~right & (iou[:, ~counts] >= NEUTRAL).any(axis=1)
+    return np.where(neutral, np.nan, right.astype(np.float64))
+
+
+def samples(cache: Path) -> tuple[Floats, NDArray[np.float64]]:
+    """Return features (N, F) and labels (N,) of all circles that could be fitted."""
+    stage, rng = CapFit(), np.random.default_rng(7)
+    rows, right = [], []
+    for case in chain(training_cases(cache), varied_cases(cache, "a", VARIED)):
+        for frame in (case.frame, worse(case.frame, rng)):
+            if frame.camera is None or frame.depth is None:
+                continue
+            for circles in detected(frame):
+                if not len(circles):
+                    continue
+                fits = stage.fit(frame.gray, frame.depth_m, frame.camera, circles)
+                label = labels(circles, case.truth)
+                use = fits.valid & np.isfinite(label)
+                rows.append(features(circles, fits)[use])
+                right.append(label[use])
+    return np.concatenate(rows), np.concatenate(right)
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cache", type=Path, default=Path("out/scenes"), help="rendered frames")
+    parser.add_argument("--out", type=Path, default=Path(f"mushpipe/stages/{MODEL}.yaml"))
+    parser.add_argument("--ridge", type=float, default=1e-3)
+    arguments = parser.parse_args()
+    rows, right = samples(arguments.cache)
+    write({MODEL: fit(rows, right, NAMES, arguments.ridge, SQUARED)}, arguments.out, HEAD)
+    print(f"{len(right)} circles, {right.mean():.2f} right")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,72 @@
+"""Depth cameras that are worse than the simulated one, for what must not rely on a good one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mushpipe import RgbdFrame
+
+Singles = NDArray[np.float32]
+
+
+def worse(frame: RgbdFrame, rng: np.random.Generator) -> RgbdFrame:
+    """Return a frame with coarser, shifted, noisier depth that lacks edges and patches."""
+    if frame.depth is None:
+        return frame
+    depth = frame.depth.astype(np.float32) * np.float32(frame.depth_scale)
+    for damage in (_coarser, _shifted, _noisier, _without_edges, _with_holes):
+        depth = damage(depth, rng)
+    native = np.clip(np.rint(depth / frame.depth_scale), 0, 65535).astype(np.uint16)
+    return replace(frame, depth=native)
+
+
+def _coarser(depth: Singles, rng: np.random.Generator) -> Singles:
+    """Every second or third pixel only, in half of the frames."""
+    if rng.random() < 0.5:
+        return depth
+    step, (height, width) = int(rng.integers(2, 4)), depth.shape
+    return depth[::step, ::step].repeat(step, axis=0).repeat(step, axis=1)[:height, :width]
+
+
+def _shifted(depth: Singles, rng: np.random.Generator) -> Singles:
+    """Aligned to colour but for a pixel or two."""
+    x, y = rng.normal(0, 1.2, 2)
+    shift = np.array([[1, 0, x], [0, 1, y]], np.float32)
+    size = (depth.shape[1], depth.shape[0])
+    moved: Any = cv2.warpAffine(depth, shift, size, flags=cv2.INTER_NEAREST, borderValue=(0.0,))
+    return np.asarray(moved, np.float32)
+
+
+def _blurred(shape: tuple[int, int], sigma: float, rng: np.random.Generator) -> Singles:
+    noise = cv2.GaussianBlur(rng.normal(0, 1, shape).astype(np.float32), (0, 0), sigma)
+    return np.asarray(noise / noise.std(), np.float32)
+
+
+def _noisier(depth: Singles, rng: np.random.Generator) -> Singles:
+    """Up to three times the noise that `cap-fit` expects, with neighbours alike."""
+    height, width = depth.shape
+    noise = _blurred((height, width), rng.uniform(0.3, 2.5), rng)
+    sigma = rng.uniform(0, 3) * (0.0003 + 0.0012 * depth)
+    return np.asarray(np.where(depth > 0, depth + sigma * noise, 0), np.float32)
+
+
+def _without_edges(depth: Singles, rng: np.random.Generator) -> Singles:
+    """Missing up to 3 px around depth edges, here and there."""
+    width = int(rng.integers(0, 4))
+    if width == 0:
+        return depth
+    around = np.ones((2 * width + 1, 2 * width + 1), np.uint8)
+    step = cv2.dilate(depth, around) - cv2.erode(depth, around)
+    lost = (step > 0.006 + 0.004 * width) & (rng.random(depth.shape) < rng.uniform(0.3, 1))
+    return np.where(lost, np.float32(0), depth)
+
+
+def _with_holes(depth: Singles, rng: np.random.Generator) -> Singles:
+    height, width = depth.shape
+    cloud = _blurred((height, width), rng.uniform(2, 8), rng)
+    return np.where(cloud > rng.uniform(1.5, 3.5), np.float32(0), depth)
