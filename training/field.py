@@ -1,7 +1,8 @@
 """Judge `phase-hough` on labelled real recordings: `python -m training.field FOLDER`.
 
 The folder holds recordings with labels beside them (`name.mcap`, `name.labels.json`); nothing is
-trained on them. Each recording is segmented with and without `flatten`.
+trained on them. Each recording is segmented with and without `flatten`. `fitted` is the detector
+with depth and `cap-fit` after it, as in graphs/classic.yaml.
 """
 
 from __future__ import annotations
@@ -17,7 +18,9 @@ import numpy as np
 from mushpipe import Circles, Mask, RgbdFrame
 from mushpipe.evaluate.matching import circle_iou
 from mushpipe.sources.mcap import McapSource
+from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.phase_hough import PhaseHough
+from training.judge import LEAST
 from training.matching import IOU, Floats
 from training.verifier import segmentations
 
@@ -72,17 +75,18 @@ def judge(path: Path) -> Iterator[str]:
         if wanted is None:
             continue
         for name, (ready, mask) in zip(("flat", "plain"), segmentations(frame), strict=True):
-            for depth in (True, False) if frame.depth is not None else (False,):
-                circles = detect(ready, mask, settings, depth)
-                kind = "depth" if depth else "image"
-                text = result(circles, *wanted)
-                yield f"{path.stem:18} #{frame.header.sequence} {name:5} {kind}: {text}"
+            for kind in ("depth", "fitted", "image") if frame.depth is not None else ("image",):
+                text = result(detect(ready, mask, settings, kind), *wanted)
+                yield f"{path.stem:18} #{frame.header.sequence} {name:5} {kind:6}: {text}"
 
 
-def detect(frame: RgbdFrame, mask: Mask, settings: dict[str, Any], depth: bool) -> Circles:
+def detect(frame: RgbdFrame, mask: Mask, settings: dict[str, Any], kind: str) -> Circles:
     """Run the detector; without depth, a range in metres becomes one in pixels."""
-    chosen = dict(settings, use_depth=depth)
-    if not depth and chosen["radius_px"] is None:
+    if kind == "fitted":
+        found = PhaseHough(**settings, min_score=LEAST).process(frame, mask)
+        return CapFit(min_score=0.5).process(frame, found)[2]
+    chosen = dict(settings, use_depth=kind == "depth")
+    if kind == "image" and chosen["radius_px"] is None:
         chosen["radius_px"] = (15, 90)
     return PhaseHough(**chosen).process(frame, mask)
 

@@ -24,6 +24,7 @@ from training.scenes import Case, choosing_cases, judging_cases
 from training.verifier import RADII, segmentations
 
 PAPER = (8.0, 38.0)  # px
+LEAST = 0.2  # score of what `cap-fit` decides about, as in the graphs
 
 
 class Detector(Protocol):
@@ -36,7 +37,7 @@ class Detector(Protocol):
 class Fitted:
     """`phase-hough` with depth down to a low score, and `cap-fit`, which decides and improves."""
 
-    _detect, _fit = PhaseHough(radius_px=RADII, min_score=0.2), CapFit(min_score=0.5)
+    _detect, _fit = PhaseHough(radius_px=RADII, min_score=LEAST), CapFit(min_score=0.5)
 
     def process(self, frame: RgbdFrame, mask: Mask) -> Circles:
         """Return the circles that stay, improved."""

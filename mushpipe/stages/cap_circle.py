@@ -15,7 +15,7 @@ from mushpipe.stages.cap_model import Floats, Singles
 from mushpipe.stages.cap_outline import expected_reach
 from mushpipe.stages.cap_samples import COMPASS, DIRECTIONS
 
-CLEAR = 0.9  # weight of a detected circle whose outline the image shows all around
+CLEAR = 0.8  # weight of a detected circle whose outline the image shows all around
 APART = 0.15  # distance of the two centres, in radii, at which that weight is halved
 HELD = 16  # rays along depth edge and outline that hold a cap; with fewer it moves the circle less
 

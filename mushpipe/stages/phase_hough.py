@@ -37,6 +37,7 @@ _TOP = 64.0  # gray levels per px; larger gradients count as this in Otsu's thre
 _AROUND = np.ones((7, 7), np.uint8)  # edges are taken so far around the foreground
 _STANDING = 0.004  # m; what is higher than this over the bed is looked at, in the mask or not
 _REACH = 2  # cells around a peak within which it must be the highest
+_LIKELY = 0.5
 _SMALLEST = 12  # px; images smaller than this in either direction hold no circle
 
 
@@ -129,9 +130,14 @@ class PhaseHough(Stage):
         if found is None:
             return Circles(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
         order, chance, owner = self.decide(found)
-        shapes = found.shapes[order]
+        shapes, score = found.shapes[order], chance[order]
+        # What is hardly a cap changes nothing about those that are likely: it takes no edges from
+        # them, and what is a cap only beside it is no more likely than it is.
+        after = np.logical_or.accumulate(score < _LIKELY)
+        score[after] = np.minimum.accumulate(score[after])
+        owner[(owner >= 0) & after[owner]] = -1
         polish(found.edges, found.height, found.pixel, shapes, owner)
-        return Circles(shapes[:, :2], equal_area_radius(shapes), chance[order])
+        return Circles(shapes[:, :2], equal_area_radius(shapes), score)
 
     def gather(
         self, frame: RgbdFrame, mask: Mask, learned: Circles | None = None

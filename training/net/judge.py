@@ -15,6 +15,7 @@ from pathlib import Path
 
 from mushpipe import Circles, RgbdFrame
 from mushpipe.sources.mcap import McapSource
+from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.cap_net import CapNet
 from mushpipe.stages.phase_hough import PhaseHough
 from training import judge
@@ -29,6 +30,10 @@ CLASSIC = {
     "depth": PhaseHough(radius_px=RADII),
     "image+net": PhaseHough(radius_px=RADII, use_depth=False, use_learned=True),
     "depth+net": PhaseHough(radius_px=RADII, use_learned=True),
+}
+FITTED = {  # down to a low score, for `cap-fit` to decide
+    "fitted": PhaseHough(radius_px=RADII, min_score=judge.LEAST),
+    "fitted+net": PhaseHough(radius_px=RADII, min_score=judge.LEAST, use_learned=True),
 }
 
 
@@ -46,14 +51,21 @@ def simulated(models: list[Path], cache: Path, peers: bool) -> str:
             for name, stage in CLASSIC.items():
                 circles = stage.process(*seen[stage.use_learned])
                 scores[case.condition, name].add(circles, case.truth, counts)
-    return judge.table(scores, [*nets, *(CLASSIC if peers else ())])
+            for name, stage in FITTED.items():
+                circles = stage.process(*seen[stage.use_learned])
+                _, _, circles = CapFit(min_score=0.5).process(case.frame, circles)
+                scores[case.condition, name].add(circles, case.truth, counts)
+    return judge.table(scores, [*nets, *((*CLASSIC, *FITTED) if peers else ())])
 
 
 def both(frame: RgbdFrame, depth: bool) -> Circles:
     """Return the circles of network and classic detector, as graphs/pick.yaml has them."""
     net = CapNet(radius_px=(8, 60), min_score=0.05)
-    stage = PhaseHough(radius_px=(8, 80), use_learned=True, use_depth=depth)
-    return stage.process(frame, *net.process(frame))
+    stage = PhaseHough(radius_px=(8, 80), min_score=judge.LEAST, use_learned=True, use_depth=depth)
+    circles = stage.process(frame, *net.process(frame))
+    if not depth:
+        return circles.take(circles.score >= 0.5)
+    return CapFit(min_score=0.5).process(frame, circles)[2]
 
 
 def real(model: Path, folder: Path) -> Iterator[str]:
