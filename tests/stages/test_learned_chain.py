@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from mushpipe.core.truth import TRUTH_TOPIC
 from mushpipe.stages.cap_net import CapNet
@@ -28,3 +29,22 @@ def test_brown_caps_among_rubble_are_found_and_refitted() -> None:
     assert both.precision >= alone.precision
     away, before = (np.median([e[0] for e in score.errors]) for score in (both, alone))
     assert away < 0.7 * before
+
+
+@pytest.mark.parametrize("learned", [False, True])
+def test_what_is_hardly_a_cap_changes_nothing_about_those_that_are_likely(learned: bool) -> None:
+    settings = {"soil": 3.0, "rubble": 50, "stumps": 5, "count": 60, "cluster": 1.0}
+    below = 0
+    for seed in (81, 82):
+        frame = simulated(seed, width=640, height=480, shape_family="b", **settings)
+        mask, circles = CapNet(radius_px=RADII, min_score=0.05).process(frame)
+        some, many = (
+            PhaseHough(radius_px=RADII, min_score=least, use_learned=learned)
+            for least in (0.5, 0.05)
+        )
+        likely, found = some.process(frame, mask, circles), many.process(frame, mask, circles)
+        same = found.take(found.score >= 0.5)
+        for column in ("center", "radius", "score"):
+            assert np.array_equal(getattr(same, column), getattr(likely, column))
+        below += len(found) - len(same)
+    assert below > 0

@@ -1,11 +1,17 @@
-"""What the verifier of `phase-hough` is taught beside a network."""
+"""What the verifiers are taught."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from mushpipe import Circles
-from training.verifier import NET, doubtful
+from mushpipe.core.truth import TRUTH_TOPIC
+from tests.stages.frames import simulated
+from training.fitted import labels
+from training.matching import counted
+from training.sensors import worse
+from training.verifier import NET, RADII, doubtful, fit
 
 
 def test_a_doubtful_network_finds_fewer_circles_with_lower_scores_and_no_others() -> None:
@@ -18,3 +24,42 @@ def test_a_doubtful_network_finds_fewer_circles_with_lower_scores_and_no_others(
     assert less.score.min() >= NET.min_score
     before = np.array([told[tuple(place)] for place in less.center])
     assert less.score.mean() < before.mean() - 0.05
+
+
+def test_a_cap_teaches_one_circle_and_what_need_not_be_found_teaches_none() -> None:
+    truth = simulated(5, width=640, height=480, count=40).attached[TRUTH_TOPIC]
+    counts = counted(truth, *RADII)
+    caps, others = np.flatnonzero(counts)[:2], np.flatnonzero(~counts)[:1]
+    rows = [caps[0], caps[0], caps[1], *others]
+    center, radius = truth.center[rows], truth.radius[rows].copy()
+    center[1] += 0.2 * radius[1]  # the worse of two on one cap
+    center, radius = np.vstack([center, [[-500.0, -500.0]]]), np.append(radius, 20.0)
+    found = labels(Circles(center, radius, np.ones(len(radius))), truth)
+    assert len(others) == 1
+    assert found[:3].tolist() == [1, 0, 1]
+    assert np.isnan(found[3])
+    assert found[4] == 0
+
+
+def test_a_worse_camera_sees_less_and_noisier_depth_where_there_was_some() -> None:
+    frame = simulated(6, width=640, height=480)
+    rng, seen = np.random.default_rng(0), frame.depth_m
+    for _ in range(5):
+        bad = worse(frame, rng)
+        assert bad.depth.shape == frame.depth.shape
+        assert np.isfinite(bad.depth_m).mean() < np.isfinite(seen).mean()
+        off = np.abs(bad.depth_m - seen)
+        assert 0 < np.nanmedian(off) < 0.005
+
+
+def test_only_some_features_are_squared() -> None:
+    rng = np.random.default_rng(0)
+    x = rng.normal(0, 1, (4000, 2))
+    right = (rng.random(4000) < 1 / (1 + np.exp(-(0.5 + x[:, 0] - 0.8 * x[:, 1] ** 2)))).astype(
+        float
+    )
+    model = fit(x, right, ("one", "two"), 1e-6, ("two",))
+    one, two = model["features"]["one"], model["features"]["two"]
+    assert one["weight"] == pytest.approx(1, abs=0.15)
+    assert one["square"] == 0
+    assert two["square"] == pytest.approx(-0.8, abs=0.15)

@@ -1,0 +1,104 @@
+"""What `cap-fit` takes for a cap, on drawn scenes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mushpipe import Circles, DepthSource, RgbdFrame
+from mushpipe.stages.cap_fit import CapFit
+from mushpipe.stages.cap_verify import NAMES, chances, features
+from mushpipe.stages.verifier import LIMIT, probability
+from tests.stages.caps import CAMERA, cap, circles_of, draw, frame_from
+
+BED = 0.44
+CAPS = [
+    cap(10, 40, (-0.07, -0.03, 0.4), 0.02, 0.55),
+    cap(20, 200, (0.0, -0.03, 0.4), 0.022, 0.6),
+    cap(0, 0, (0.07, -0.03, 0.4), 0.018, 0.65),
+    cap(15, 100, (0.07, 0.04, 0.405), 0.021, 0.5),
+]
+
+
+def scene() -> tuple[np.ndarray, np.ndarray, Circles]:
+    """Four caps, then a tilted board and a pile of clods that look like discs of 22 px."""
+    depth, gray = draw(CAPS, BED)
+    rng = np.random.default_rng(0)
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    board, pile = (np.hypot(u - x, v - 165) < 22 for x in (90, 160))
+    depth[board] = (0.41 + 0.0008 * (u - 90))[board]
+    clods = rng.uniform(0.395, 0.43, (CAMERA.height // 6 + 1, CAMERA.width // 6 + 1))
+    depth[pile] = np.kron(clods, np.ones((6, 6)))[: CAMERA.height, : CAMERA.width][pile]
+    gray[board | pile] = 0.8
+    depth += rng.normal(0, 0.0008, depth.shape)
+    caps = circles_of(CAPS)
+    center = np.vstack([caps.center, [[90, 165], [160, 165]]])
+    return depth, gray, Circles(center, [*caps.radius, 22.0, 22.0], np.full(6, 0.6))
+
+
+def test_caps_stay_and_what_only_looks_like_one_goes() -> None:
+    depth, gray, circles = scene()
+    frame = frame_from(depth, gray)
+    locations, poses, found = CapFit(up="camera", min_score=0.5).process(frame, circles)
+    assert found.center == pytest.approx(circles.center[:4], abs=1)
+    assert (found.score > 0.8).all()
+    assert len(locations) == len(poses) == 4
+    _, _, all_of_them = CapFit(up="camera", min_score=0.0).process(frame, circles)
+    assert all_of_them.score[:4] == pytest.approx(found.score)
+    assert (all_of_them.score[4:] < 0.5).all()
+
+
+def test_without_a_least_score_nothing_is_left_out_and_scores_stay() -> None:
+    depth, gray, circles = scene()
+    locations, poses, found = CapFit(up="camera").process(frame_from(depth, gray), circles)
+    assert found.score == pytest.approx(circles.score, abs=0)
+    assert len(found) == len(locations) == len(poses) == 6
+
+
+def test_the_score_of_the_detector_decides_where_there_is_no_depth() -> None:
+    depth, gray, circles = scene()
+    circles = Circles(circles.center, circles.radius, [0.6, 0.3, 0.6, 0.6, 0.6, 0.6])
+    stage = CapFit(up="camera", min_score=0.5)
+    depth[:, :200] = np.nan  # the first two caps, board and pile
+    locations, _, found = stage.process(frame_from(depth, gray), circles)
+    assert found.score[0] == pytest.approx(0.6)
+    assert locations.source[0] == DepthSource.MISSING
+    assert len(found) == 5  # but for the second cap
+    blind = frame_from(depth, gray)
+    blind = RgbdFrame(blind.header, blind.color, None, 1.0, CAMERA)
+    locations, poses, found = stage.process(blind, circles)
+    assert np.array_equal(found.center, circles.center[[0, 2, 3, 4, 5]])
+    assert len(locations) == len(poses) == 5
+
+
+def test_features_of_what_was_not_fitted_are_unknown_and_its_score_stays() -> None:
+    depth, gray, circles = scene()
+    depth[:, :200] = np.nan
+    frame = frame_from(depth, gray)
+    fits = CapFit(up="camera").fit(frame.gray, frame.depth_m, CAMERA, circles)
+    assert fits.valid.tolist() == [False, False, True, True, False, False]
+    table = features(circles, fits)
+    assert table.shape == (6, len(NAMES))
+    assert np.isnan(table[~fits.valid]).all()
+    assert np.isfinite(table[fits.valid]).all()
+    assert np.array_equal(chances(circles, fits)[~fits.valid], circles.score[~fits.valid])
+
+
+def test_a_surer_detector_never_makes_a_cap_less_likely() -> None:
+    depth, gray, circles = scene()
+    frame = frame_from(depth, gray)
+    fits = CapFit(up="camera").fit(frame.gray, frame.depth_m, CAMERA, circles)
+    chance = [
+        chances(Circles(circles.center, circles.radius, np.full(6, score)), fits)
+        for score in np.linspace(0, 1, 21)
+    ]
+    assert (np.diff(chance, axis=0) >= 0).all()
+
+
+def test_the_probability_is_the_logistic_of_clipped_standardised_features() -> None:
+    weights = np.array([[1.0, 2.0, 0.7, -0.1], [0.0, 0.5, -0.4, 0.3], [0.0, 1.0, 0.2, 0.0]])
+    rows = np.array([[3.0, 0.25], [100.0, -100.0]])
+    first = 0.2 + 0.7 * 1 - 0.1 * 1 - 0.4 * 0.5 + 0.3 * 0.25
+    second = 0.2 + 0.7 * LIMIT - 0.1 * LIMIT**2 + 0.4 * LIMIT + 0.3 * LIMIT**2
+    expected = 1 / (1 + np.exp(-np.array([first, second])))
+    assert probability(rows, weights) == pytest.approx(expected)
