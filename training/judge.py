@@ -24,6 +24,7 @@ from training.scenes import Case, choosing_cases, judging_cases
 from training.verifier import RADII, segmentations
 
 PAPER = (8.0, 38.0)  # px
+BEDS = ("even", "gradient", "dense", "brown", "tilted")
 LEAST = 0.2  # score of what `cap-fit` decides about, as in the graphs
 
 
@@ -77,11 +78,12 @@ def table(scores: dict[tuple[str, str], Score], names: list[str]) -> str:
         row = [scores[condition, name] for name in names]
         cells = (f"{s.f:.3f} ({s.recall:.2f}/{s.precision:.2f})" for s in row)
         lines.append(f"{condition:10}" + "".join(f"{cell:>20}" for cell in cells))
-    for name in names:
-        whole = Score()
-        for condition in conditions:
-            whole.merge(scores[condition, name])
-        lines.append(f"{name:12} all: F {whole.f:.4f}, " + errors(whole))
+    for title, part in (("all", conditions), ("beds", BEDS)):
+        for name in names:
+            whole = Score()
+            for condition in part:
+                whole.merge(scores[condition, name])
+            lines.append(f"{name:12} {title}: F {whole.f:.4f}, " + errors(whole))
     return "\n".join(lines)
 
 

@@ -135,7 +135,7 @@ class PhaseHough(Stage):
         # them, and what is a cap only beside it is no more likely than it is.
         after = np.logical_or.accumulate(score < _LIKELY)
         score[after] = np.minimum.accumulate(score[after])
-        owner[(owner >= 0) & after[owner]] = -1
+        owner[np.isin(owner, np.flatnonzero(after))] = -1
         polish(found.edges, found.height, found.pixel, shapes, owner)
         return Circles(shapes[:, :2], equal_area_radius(shapes), score)
 

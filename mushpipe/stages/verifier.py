@@ -42,7 +42,8 @@ def read_models(path: Path, names: Sequence[str], features: Sequence[str]) -> di
     except KeyError as error:
         raise UsageError(f"verifier {path}: it lacks {error}; {_EXPECTED}") from error
     except (yaml.YAMLError, TypeError, ValueError) as error:
-        raise UsageError(f"verifier {path}: {error}; {_EXPECTED}") from error
+        text = " ".join(str(error).split())  # in one line
+        raise UsageError(f"verifier {path}: {text}; {_EXPECTED}") from error
 
 
 def weights_of(model: dict[str, Any], features: Sequence[str]) -> Floats:

@@ -167,11 +167,12 @@ def test_live_and_every_kind_of_recording_of_a_scene_give_the_same_picks(tmp_pat
     run_demo(tmp_path, f"{{use: mcap, path: {ros_bag}}}", "ros.mcap")
     for ours, ros in zip(picks(first), picks(results(tmp_path / "ros.mcap")), strict=True):
         # ROS has whole millimetres, cut off. By that they may change places, what is hardly a
-        # mushroom may be one or not, and an outline that is half hidden move by part of a pixel.
+        # mushroom may be one or not, and an outline that is half hidden, which depth completes,
+        # move by part of a pixel.
         apart = np.linalg.norm(ours.center[:, None] - ros.center, axis=-1)
         row, column = np.nonzero(apart < 0.5)
         assert np.median(apart[row, column]) < 0.01
-        assert (apart[row, column] < 0.1).mean() > 0.9
+        assert (apart[row, column] < 0.2).mean() > 0.9
         assert len(set(row)) == len(set(column)) == len(row) > 0.9 * len(ours)
         for table, matched in ((ours, row), (ros, column)):
             assert (np.delete(table.score, matched) < UNSURE).all()
