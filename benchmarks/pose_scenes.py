@@ -19,7 +19,9 @@ from mushpipe.core.truth import TRUTH_TOPIC, Ignore, Truth
 from mushpipe.evaluate.matching import match
 from mushpipe.evaluate.truth import FrameTruth
 from mushpipe.sources.synthetic import SyntheticSource
+from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.cap_net import CapNet
+from mushpipe.stages.cap_verify import chances
 from mushpipe.stages.phase_hough import PhaseHough
 
 GRAPH = Path(__file__).parents[1] / "graphs" / "pick.yaml"
@@ -65,20 +67,26 @@ def truth_of(frame: RgbdFrame) -> Truth:
 
 
 @lru_cache
-def detector() -> tuple[CapNet, PhaseHough]:
-    """Return the stages of `graphs/pick.yaml` that find circles, for caps of any size."""
-    plan = compile_document(read_document(GRAPH), load_registry(), ["detect.radius_px=null"])
+def detector() -> tuple[CapNet, PhaseHough, CapFit]:
+    """Return the stages of `graphs/pick.yaml` that find and choose circles, of any size."""
+    settings = ["detect.radius_px=null", "pose.depth_bias_mm=2.85"]
+    plan = compile_document(read_document(GRAPH), load_registry(), settings)
     stages = {node.name: node.plugin for node in plan.stages}
     net, detect = cast(CapNet, stages["net"]), cast(PhaseHough, stages["detect"])
-    net.open()
-    detect.open()
-    return net, detect
+    pose = cast(CapFit, stages["pose"])
+    for stage in (net, detect, pose):
+        stage.open()
+    return net, detect, pose
 
 
 def found_in(frame: RgbdFrame) -> Circles:
-    """Return the circles that the detector finds."""
-    net, detect = detector()
-    return detect.process(frame, *net.process(frame))
+    """Return the circles that are taken for caps, as they were detected."""
+    net, detect, pose = detector()
+    circles = detect.process(frame, *net.process(frame))
+    if not len(circles) or frame.camera is None:
+        return circles
+    fits = pose.fit(frame.gray, frame.depth_m, frame.camera, circles)
+    return circles.take(chances(circles, fits) >= (pose.min_score or 0.0))
 
 
 def detected(frame: RgbdFrame) -> tuple[Circles, np.ndarray]:
