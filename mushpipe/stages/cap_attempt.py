@@ -92,7 +92,7 @@ def attempt(
     if refine(cap, rays, count, upright, setting, (0, 2), work)[0] < 0.0:
         return 0, np.inf
     lines = sample_outline(
-        gray, image[1], image[2], rank, cap, circle, focal, settings[2], work[1], rays[:, count:]
+        gray, image[1], image[2], rank, cap, circle, focal, settings[2], rays[:, count:]
     )
     total, misfit = refine(cap, rays, count + lines, upright, setting, (2, 4), work)
     return (lines, misfit) if total >= 0.0 else (0, np.inf)
@@ -175,11 +175,11 @@ def mend(
         room: From `scratch`.
     """
     _, image, focal = frame
-    bias, (work, _, other) = settings[1][2], room
+    bias, other = settings[1][2], room[2]
     if fit[2][6] > ASTRAY * (fit[2][0] + fit[2][6]):
         return
     reach, grown = np.empty(DIRECTIONS), np.empty(3)
-    expected_reach(fit[1], image[1], focal, circle, work[1], reach)
+    expected_reach(fit[1], image[1], focal, circle, reach)
     denied = denials(image, ranks, fit[1], bias, circle, reach)
     if misfit < POOR and denied < DENIED:
         return
@@ -189,7 +189,7 @@ def mend(
     rest = fit_circle(frame, grown, ranks[0], upright, settings, other, room)
     if not rest < 2.0 * POOR:
         return  # neither is believed
-    expected_reach(other[1], image[1], focal, grown, work[1], reach)
+    expected_reach(other[1], image[1], focal, grown, reach)
     still = denials(image, ranks, other[1], bias, grown, reach)
     if rest + DENIAL * still < MENDED * (misfit + DENIAL * denied):
         fit[0][:], fit[1][:], fit[2][:] = other

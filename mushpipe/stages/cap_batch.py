@@ -136,7 +136,7 @@ def second_fits(
         counts[i, 3], counts[i, 5] = refine(caps[i], rays[i], count, own, setting, (4, 5), work)
         invert(work[0][0], covariances[i])
         held, doubt = (counts[i, 1], counts[i, 2]), max(1.0, counts[i, 5] / POOR)
-        improve(circles[i], caps[i], held, doubt, image[1], focal, work[1])
+        improve(circles[i], caps[i], held, doubt, image[1], focal)
         ray = ray_at(image[1], focal, circles[i, 0], circles[i, 1])
         locate(caps[i], ray, covariances[i], noise.circle_px / focal, surfaces[i])
 

@@ -49,7 +49,6 @@ def improve(
     doubt: float,
     rays: Singles,
     focal: float,
-    flat: Singles,
 ) -> None:
     """Move a circle (3,) x, y, radius, px, towards the outline of its cap, in place.
 
@@ -61,10 +60,9 @@ def improve(
         doubt: 1 where the cap fits, larger where it fits badly.
         rays: (H, W, 2) rays at z = 1.
         focal: Focal length, px.
-        flat: (14 ROOM,) room for rows.
     """
     reach, outline = np.empty(DIRECTIONS), np.empty(3)
-    expected_reach(cap, rays, focal, circle, flat, reach)
+    expected_reach(cap, rays, focal, circle, reach)
     circle_around(circle, reach, outline)
     apart = np.hypot(outline[0] - circle[0], outline[1] - circle[1]) / (APART * outline[2])
     step = 1.0 - CLEAR * held[1] / DIRECTIONS / (1.0 + apart * apart)

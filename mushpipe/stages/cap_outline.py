@@ -9,8 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
-from mushpipe.stages.cap_model import ROOM, UNKNOWNS, Floats, Single, Singles, fill_rows
-from mushpipe.stages.cap_samples import COMPASS, DIRECTIONS, EDGE_SHARE, ray_at, touch
+from mushpipe.stages.cap_model import RADIUS, Floats, Single, Singles, frozen, meet, slope
+from mushpipe.stages.cap_samples import (
+    COMPASS,
+    DIRECTIONS,
+    EAST,
+    EDGE_SHARE,
+    SOUTH,
+    ray_at,
+    touch,
+)
 
 STEP = 0.5  # px between places on a line
 REACH = 12  # steps to either side that are looked at, at most
@@ -51,29 +59,50 @@ def look_along(
 
 
 @jit
-def expected_reach(
-    cap: Floats, rays: Singles, focal: float, circle: Floats, flat: Singles, reach: Floats
-) -> None:
+def expected_reach(cap: Floats, rays: Singles, focal: float, circle: Floats, reach: Floats) -> None:
     """Fill how far (DIRECTIONS,), px, the outline of a cap lies from the centre of a circle.
+
+    Two steps, each by how far outside of the outline the ray of the place found so far passes.
 
     Args:
         cap: (15,) the cap.
-        rays: (H, W, 2) rays at z = 1.
+        rays: (H, W, 2) rays at z = 1; outside of the image as without distortion.
         focal: Focal length, px.
         circle: (3,) x, y, radius, px, near the outline.
-        flat: (14 ROOM,) room for rows.
         reach: Out, per direction of `COMPASS`.
     """
-    lines, longest = np.zeros((4, DIRECTIONS), np.float32), 0.3 * circle[2]
-    reach[:] = circle[2]
+    c, half = frozen(cap), Single(0.5)
+    x, y, z, per_radius = Single(cap[0]), Single(cap[1]), Single(cap[2]), Single(1 / cap[RADIUS])
+    middle, per_focal = np.sqrt(x * x + y * y + z * z), Single(1 / focal)
+    right, bottom = np.int32(rays.shape[1] - 1), np.int32(rays.shape[0] - 1)
+    u0, v0, longest = Single(circle[0]), Single(circle[1]), Single(0.3 * circle[2])
+    pixel = Single(focal / cap[2])
+    # in one array at fixed distances the compiler sees that nothing overlaps: SIMD
+    row, pixels = np.empty(5 * DIRECTIONS, np.float32), np.empty((2, DIRECTIONS), np.int32)
+    row[:DIRECTIONS] = Single(circle[2])
     for _ in range(2):
         for j in range(DIRECTIONS):
-            x, y = circle[0] + reach[j] * COMPASS[j, 0], circle[1] + reach[j] * COMPASS[j, 1]
-            lines[0, j], lines[1, j], lines[2, j] = ray_at(rays, focal, x, y)
-        fill_rows(cap, lines, DIRECTIONS, flat)
+            u, v = u0 + row[j] * EAST[j], v0 + row[j] * SOUTH[j]
+            column = min(max(np.int32(np.floor(u + half)), np.int32(0)), right)
+            line = min(max(np.int32(np.floor(v + half)), np.int32(0)), bottom)
+            row[j + DIRECTIONS] = (u - Single(column)) * per_focal
+            row[j + 2 * DIRECTIONS] = (v - Single(line)) * per_focal
+            pixels[0, j], pixels[1, j] = column, line
         for j in range(DIRECTIONS):
-            step = flat[UNKNOWNS * ROOM + j] * focal / cap[2]
-            reach[j] -= min(max(step, -longest), longest)
+            near = rays[pixels[1, j], pixels[0, j]]
+            row[j + 3 * DIRECTIONS], row[j + 4 * DIRECTIONS] = near[0], near[1]
+        for j in range(DIRECTIONS):
+            across = row[j + 3 * DIRECTIONS] + row[j + DIRECTIONS]
+            down = row[j + 4 * DIRECTIONS] + row[j + 2 * DIRECTIONS]
+            along = Single(1) / np.sqrt(Single(1) + across * across + down * down)
+            ray = (across * along, down * along, along)
+            q0, q1 = (middle * ray[0] - x) * per_radius, (middle * ray[1] - y) * per_radius
+            q2 = (middle * ray[2] - z) * per_radius
+            t, k, _ = meet(c, (q0, q1, q2), ray, True)
+            outside = slope(c, (q0 + t * ray[0], q1 + t * ray[1], q2 + t * ray[2]), ray, k)[0]
+            row[j] -= min(max(outside * pixel, -longest), longest)
+    for j in range(DIRECTIONS):
+        reach[j] = row[j]
 
 
 @jit
@@ -103,7 +132,7 @@ def steepest(profile: Singles, count: int, sign: float) -> tuple[float, float]:
 @jit
 def sample_outline(
     gray: Singles, rays: Singles, ranks: NDArray[np.int16], rank: int, cap: Floats, circle: Floats,
-    focal: float, sigma: float, flat: Singles, out: Singles,
+    focal: float, sigma: float, out: Singles,
 ) -> int:  # fmt: skip
     """Find the outline of a cap in the colour image, in 32 directions.
 
@@ -116,14 +145,13 @@ def sample_outline(
         circle: (3,) x, y, radius, px.
         focal: Focal length, px.
         sigma: Of a place on the outline, px.
-        flat: (14 ROOM,) room for rows.
         out: (6, DIRECTIONS) out: rays that touch the cap, as in `touch`.
 
     Returns:
         Number of rays.
     """
     profiles, reaches = np.empty((DIRECTIONS, 2 * REACH + 1), np.float32), np.empty(DIRECTIONS)
-    expected_reach(cap, rays, focal, circle, flat, reaches)
+    expected_reach(cap, rays, focal, circle, reaches)
     half = min(REACH, max(5, int(0.2 * circle[2] / STEP)))
     count, contrast = 2 * half + 1, 0.0
     for j in range(DIRECTIONS):

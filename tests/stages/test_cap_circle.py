@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from mushpipe import Camera, Circles
 from mushpipe.stages.cap_circle import circle_around, improve
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_model import ROOM, SIZE, span
+from mushpipe.stages.cap_model import SIZE, span
 from mushpipe.stages.cap_samples import COMPASS
 from mushpipe.stages.upright import pixel_rays
 from tests.stages.caps import CAMERA, Cap, cap, circle_of, circles_of, draw, frame_from
@@ -56,8 +56,7 @@ def test_a_cap_that_the_image_does_not_show_has_the_circle_of_its_outline(
     true = cap(tilt, 70, place, 0.022, 0.7)
     outline = np.array(circle_of(true, camera))
     circle = outline + np.array([2.0, -1.5, 3.0])
-    room = np.zeros(14 * ROOM, np.float32)
-    improve(circle, parameters(true), (16.0, 0.0), 1.0, pixel_rays(camera), camera.fx, room)
+    improve(circle, parameters(true), (16.0, 0.0), 1.0, pixel_rays(camera), camera.fx)
     assert np.abs(circle - outline).max() < 0.2
 
 
@@ -89,11 +88,11 @@ def test_the_image_has_the_say_where_it_shows_all_of_an_outline() -> None:
 
 def test_a_cap_that_nothing_holds_does_not_move_its_circle() -> None:
     true = cap(0, 0, (0, 0, 0.4), 0.022, 0.55)
-    room, moved = np.zeros(14 * ROOM, np.float32), []
+    moved = []
     detected = np.array(circle_of(true)) + np.array([3.0, 0.0, 0.0])
     for held, doubt in (((16.0, 0.0), 1.0), ((16.0, 0.0), 3.0), ((4.0, 0.0), 1.0)):
         circle = detected.copy()
-        improve(circle, parameters(true), held, doubt, pixel_rays(CAMERA), CAMERA.fx, room)
+        improve(circle, parameters(true), held, doubt, pixel_rays(CAMERA), CAMERA.fx)
         moved.append(float(np.linalg.norm(circle[:2] - detected[:2])))
     assert moved[0] == pytest.approx(3.0, abs=0.15)
     assert moved[1] < 1.1
