@@ -30,7 +30,7 @@ def features(circles: Circles, fits: Fits) -> Floats:
     circle, in its radii.
     """
     score = np.clip(circles.score, 1e-4, 1 - 1e-4)
-    usual = np.median(fits.misfit[fits.valid]) if fits.valid.any() else 1.0
+    usual = max(np.median(fits.misfit[fits.valid]), 1e-6) if fits.valid.any() else 1.0
     table = np.column_stack(
         [
             np.log(score / (1 - score)),

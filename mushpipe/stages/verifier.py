@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +23,7 @@ _EXPECTED = "expected a file as `make verifier` writes it"
 
 def package_file(name: str) -> Path:
     """Return a file of weights that comes with the package."""
-    with resources.as_file(resources.files("mushpipe.stages") / name) as path:
-        return path
+    return Path(__file__).with_name(name)
 
 
 def read_models(path: Path, names: Sequence[str], features: Sequence[str]) -> dict[str, Floats]:
