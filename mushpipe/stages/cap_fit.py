@@ -65,7 +65,7 @@ class CapFit(Stage):
     )
 
     def open(self) -> None:
-        """Compile the kernels."""
+        """Compile the kernels, and read the verifier if it is asked."""
         camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
         circles = Circles(np.array([[32.0, 24.0]]), np.array([9.0]), np.ones(1))
         gray, depth = np.zeros((48, 64), np.float32), np.full((48, 64), 0.4, np.float32)
@@ -74,6 +74,8 @@ class CapFit(Stage):
         order = by_depth(depth, _discs(circles))
         fits = self.fit(gray, depth, camera, circles, order)
         self._bridge(np.arange(1), fits, depth, camera, circles, order)
+        if self.min_score is not None:
+            chances(circles, fits)
 
     def process(self, frame: RgbdFrame, circles: Circles) -> tuple[Locations, Poses, Circles]:
         """Return the circles, improved, and one location and one pose for each.
