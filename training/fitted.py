@@ -28,7 +28,6 @@ from training.sensors import worse
 from training.verifier import NET, RADII, VARIED, Floats, fit, segmentations, write
 
 LEAST = 0.1  # score
-SQUARED = ("aspect",)  # a cap is neither flat nor a ball; of the others more is better, or less
 NEUTRAL = 0.3  # IoU with a mushroom that need not be found, from which on a circle teaches nothing
 ALONE = PhaseHough(radius_px=RADII, min_score=LEAST)
 BESIDE = PhaseHough(radius_px=RADII, min_score=LEAST, use_learned=True)
@@ -83,7 +82,7 @@ def main() -> None:
     parser.add_argument("--ridge", type=float, default=1e-3)
     arguments = parser.parse_args()
     rows, right = samples(arguments.cache)
-    write({MODEL: fit(rows, right, NAMES, arguments.ridge, SQUARED)}, arguments.out, HEAD)
+    write({MODEL: fit(rows, right, NAMES, arguments.ridge, ())}, arguments.out, HEAD)
     print(f"{len(right)} circles, {right.mean():.2f} right")
 
 

@@ -19,6 +19,7 @@ from mushpipe.stages.verifier import package_file, probability, read_models
 Floats = NDArray[np.float64]
 MODEL = "fitted"
 FILE = f"{MODEL}.yaml"
+ROUND = 0.6  # height over radius; a rounder cap is no more, and no less, likely one
 NAMES = ("score", "misfit", "tilt", "aspect", "moved")
 
 
@@ -26,8 +27,8 @@ def features(circles: Circles, fits: Fits) -> Floats:
     """Return the features (N, F) in the order of `NAMES`; NaN where nothing was fitted.
 
     Logit of the score; log of the misfit over the median in view, since what fits how well depends
-    on the sensor; log of the sigma of the tilt, rad; height over radius; how far the fit moves the
-    circle, in its radii.
+    on the sensor; log of the sigma of the tilt, rad; height over radius, up to `ROUND`; how far the
+    fit moves the circle, in its radii.
     """
     score = np.clip(circles.score, 1e-4, 1 - 1e-4)
     usual = max(np.median(fits.misfit[fits.valid]), 1e-6) if fits.valid.any() else 1.0
@@ -36,7 +37,7 @@ def features(circles: Circles, fits: Fits) -> Floats:
             np.log(score / (1 - score)),
             np.log(np.clip(fits.misfit / usual, 0.1, 10)),
             np.log(np.clip(fits.sigma_tilt, 0.02, 3)),
-            np.clip(fits.height / fits.radius, 0.2, 1.5),
+            np.clip(fits.height / fits.radius, 0.2, ROUND),
             np.linalg.norm(fits.circle[:, :2] - circles.center, axis=1) / circles.radius,
         ]
     )
