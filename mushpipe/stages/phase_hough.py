@@ -80,7 +80,8 @@ class PhaseHough(Stage):
     )
     radius_px: tuple[Positive, Positive] | None = Field(
         (8.0, 38.0),
-        description="smallest and largest radius, px; null takes them from diameter_mm and depth",
+        description="smallest and largest radius looked for, px; outlines may be fitted a tenth "
+        "beyond; null takes them from diameter_mm and depth",
     )
     diameter_mm: tuple[Positive, Positive] = Field(
         (8.0, 120.0), description="smallest and largest diameter, mm, where there is depth"
