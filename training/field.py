@@ -18,9 +18,8 @@ import numpy as np
 from mushpipe import Circles, Mask, RgbdFrame
 from mushpipe.evaluate.matching import circle_iou
 from mushpipe.sources.mcap import McapSource
-from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.phase_hough import PhaseHough
-from training.judge import LEAST
+from training.judge import LEAST, kept
 from training.matching import IOU, Floats
 from training.verifier import segmentations
 
@@ -84,7 +83,7 @@ def detect(frame: RgbdFrame, mask: Mask, settings: dict[str, Any], kind: str) ->
     """Run the detector; without depth, a range in metres becomes one in pixels."""
     if kind == "fitted":
         found = PhaseHough(**settings, min_score=LEAST).process(frame, mask)
-        return CapFit(min_score=0.5).process(frame, found)[2]
+        return kept(frame, found)
     chosen = dict(settings, use_depth=kind == "depth")
     if kind == "image" and chosen["radius_px"] is None:
         chosen["radius_px"] = (15, 90)

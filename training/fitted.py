@@ -12,8 +12,6 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from mushpipe import Circles, RgbdFrame
 from mushpipe.core.truth import Truth
@@ -21,7 +19,7 @@ from mushpipe.evaluate.matching import circle_iou
 from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.cap_verify import MODEL, NAMES, features
 from mushpipe.stages.phase_hough import PhaseHough
-from training.matching import IOU, counted
+from training.matching import counted, matched
 from training.net.scenes import varied_cases
 from training.scenes import training_cases
 from training.sensors import worse
@@ -48,14 +46,12 @@ def labels(circles: Circles, truth: Truth) -> Floats:
     """Return 1 for circles (N,) that are a cap's, 0 for others, NaN for those that do not count."""
     counts = counted(truth, *RADII)
     iou = circle_iou(circles.center, circles.radius, truth.center, truth.radius)
-    rows, columns = linear_sum_assignment(np.where(iou[:, counts] >= IOU, -iou[:, counts], 1.0))
-    right = np.zeros(len(circles), bool)
-    right[rows] = iou[:, counts][rows, columns] >= IOU
+    right = np.isin(np.arange(len(circles)), matched(iou, counts)[0])
     neutral = ~right & (iou[:, ~counts] >= NEUTRAL).any(axis=1)
     return np.where(neutral, np.nan, right.astype(np.float64))
 
 
-def samples(cache: Path) -> tuple[Floats, NDArray[np.float64]]:
+def samples(cache: Path) -> tuple[Floats, Floats]:
     """Return features (N, F) and labels (N,) of all circles that could be fitted."""
     stage, rng = CapFit(), np.random.default_rng(7)
     rows, right = [], []

@@ -35,15 +35,22 @@ class Detector(Protocol):
         """Return the circles."""
 
 
+CAP_FIT = CapFit(min_score=0.5)
+
+
+def kept(frame: RgbdFrame, circles: Circles) -> Circles:
+    """Return the circles that `cap-fit` takes for caps, improved."""
+    return CAP_FIT.process(frame, circles)[2]
+
+
 class Fitted:
     """`phase-hough` with depth down to a low score, and `cap-fit`, which decides and improves."""
 
-    _detect, _fit = PhaseHough(radius_px=RADII, min_score=LEAST), CapFit(min_score=0.5)
+    _detect = PhaseHough(radius_px=RADII, min_score=LEAST)
 
     def process(self, frame: RgbdFrame, mask: Mask) -> Circles:
         """Return the circles that stay, improved."""
-        _, _, circles = self._fit.process(frame, self._detect.process(frame, mask))
-        return circles
+        return kept(frame, self._detect.process(frame, mask))
 
 
 DETECTORS: dict[str, Detector] = {

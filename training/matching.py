@@ -21,6 +21,19 @@ def counted(truth: Truth, smallest: float, largest: float) -> NDArray[np.bool_]:
     return (truth.ignore == 0) & (truth.radius >= smallest) & (truth.radius <= largest)
 
 
+def matched(iou: Floats, counts: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the circles and the caps that go together, of a table of IoU (circles, caps).
+
+    Args:
+        iou: (N, M).
+        counts: (M,) which caps must be found.
+    """
+    rows, columns = linear_sum_assignment(np.where(iou[:, counts] >= IOU, -iou[:, counts], 1.0))
+    columns = np.flatnonzero(counts)[columns]
+    good = iou[rows, columns] >= IOU
+    return rows[good], columns[good]
+
+
 @dataclass
 class Score:
     """Counts over frames, and the errors of what was matched.
@@ -38,10 +51,7 @@ class Score:
     def add(self, circles: Circles, truth: Truth, counts: NDArray[np.bool_]) -> None:
         """Match the circles of a frame with its truth."""
         iou = circle_iou(circles.center, circles.radius, truth.center, truth.radius)
-        rows, columns = linear_sum_assignment(np.where(iou[:, counts] >= IOU, -iou[:, counts], 1.0))
-        columns = np.flatnonzero(counts)[columns]
-        good = iou[rows, columns] >= IOU
-        rows, columns = rows[good], columns[good]
+        rows, columns = matched(iou, counts)
         neutral = (iou[:, ~counts] >= IOU).any(axis=1)
         wrong = np.setdiff1d(np.flatnonzero(~neutral), rows)
         self.right += len(rows)

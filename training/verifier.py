@@ -172,10 +172,7 @@ def fit(
     """
     mean, scale = features.mean(axis=0), np.maximum(features.std(axis=0), 1e-3)
     z = np.clip((features - mean) / scale, -LIMIT, LIMIT)
-    basis = np.column_stack([np.ones(len(z)), z, z * z])
-    basis[:, 1 + len(names) :] *= [
-        name in (names if squared is None else squared) for name in names
-    ]
+    basis = np.column_stack([np.ones(len(z)), z, z * z * np.isin(names, squared)])
 
     def loss(w: Floats) -> tuple[float, Floats]:
         logit = basis @ w

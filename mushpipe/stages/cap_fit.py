@@ -78,7 +78,7 @@ class CapFit(Stage):
             chances(circles, fits)
 
     def process(self, frame: RgbdFrame, circles: Circles) -> tuple[Locations, Poses, Circles]:
-        """Return the circles, improved, and one location and one pose for each.
+        """Return one location and one pose per circle, and the circles, improved.
 
         Raises:
             InputError: The frame has depth but no calibration.

@@ -168,6 +168,23 @@ def slope(c: Cap, q: Vector, ray: Vector, k: float) -> tuple[float, ...]:
     )
 
 
+@inlined
+def beside(center: Vector, middle: float, per_radius: float, ray: Vector) -> Vector:
+    """Return where a ray is as far away as C, from C in radii.
+
+    Args:
+        center: C, m.
+        middle: How far away C is, m.
+        per_radius: 1 over the radius, 1/m.
+        ray: Unit vector.
+    """
+    return (
+        (middle * ray[0] - center[0]) * per_radius,
+        (middle * ray[1] - center[1]) * per_radius,
+        (middle * ray[2] - center[2]) * per_radius,
+    )
+
+
 @jit
 def fill_rows(cap: Floats, rays: Singles, count: int, flat: Singles) -> None:
     """Fill a column of rows for each ray.
@@ -196,9 +213,7 @@ def fill_rows(cap: Floats, rays: Singles, count: int, flat: Singles) -> None:
         ray = (flat[j + 10 * ROOM], flat[j + 11 * ROOM], flat[j + 12 * ROOM])
         far = flat[j + 13 * ROOM]
         touches = far == Single(0)
-        # where the ray is as far away as C
-        q0, q1 = (middle * ray[0] - x) * per_radius, (middle * ray[1] - y) * per_radius
-        q2 = (middle * ray[2] - z) * per_radius
+        q0, q1, q2 = beside((x, y, z), middle, per_radius, ray)
         t, k, crosses = meet(c, (q0, q1, q2), ray, touches)
         hit = crosses & (not touches)
         q = (q0 + t * ray[0], q1 + t * ray[1], q2 + t * ray[2])

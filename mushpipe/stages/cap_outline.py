@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
-from mushpipe.stages.cap_model import RADIUS, Floats, Single, Singles, frozen, meet, slope
+from mushpipe.stages.cap_model import RADIUS, Floats, Single, Singles, beside, frozen, meet, slope
 from mushpipe.stages.cap_samples import (
     COMPASS,
     DIRECTIONS,
@@ -96,13 +96,11 @@ def expected_reach(cap: Floats, rays: Singles, focal: float, circle: Floats, rea
             down = row[j + 4 * DIRECTIONS] + row[j + 2 * DIRECTIONS]
             along = Single(1) / np.sqrt(Single(1) + across * across + down * down)
             ray = (across * along, down * along, along)
-            q0, q1 = (middle * ray[0] - x) * per_radius, (middle * ray[1] - y) * per_radius
-            q2 = (middle * ray[2] - z) * per_radius
+            q0, q1, q2 = beside((x, y, z), middle, per_radius, ray)
             t, k, _ = meet(c, (q0, q1, q2), ray, True)
             outside = slope(c, (q0 + t * ray[0], q1 + t * ray[1], q2 + t * ray[2]), ray, k)[0]
             row[j] -= min(max(outside * pixel, -longest), longest)
-    for j in range(DIRECTIONS):
-        reach[j] = row[j]
+    reach[:] = row[:DIRECTIONS]
 
 
 @jit

@@ -37,7 +37,7 @@ _TOP = 64.0  # gray levels per px; larger gradients count as this in Otsu's thre
 _AROUND = np.ones((7, 7), np.uint8)  # edges are taken so far around the foreground
 _STANDING = 0.004  # m; what is higher than this over the bed is looked at, in the mask or not
 _REACH = 2  # cells around a peak within which it must be the highest
-_LIKELY = 0.5
+_LIKELY = 0.5  # score from which on a circle is more likely a cap than not
 _SMALLEST = 12  # px; images smaller than this in either direction hold no circle
 
 

@@ -15,7 +15,6 @@ from pathlib import Path
 
 from mushpipe import Circles, RgbdFrame
 from mushpipe.sources.mcap import McapSource
-from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.cap_net import CapNet
 from mushpipe.stages.phase_hough import PhaseHough
 from training import judge
@@ -52,8 +51,7 @@ def simulated(models: list[Path], cache: Path, peers: bool) -> str:
                 circles = stage.process(*seen[stage.use_learned])
                 scores[case.condition, name].add(circles, case.truth, counts)
             for name, stage in FITTED.items():
-                circles = stage.process(*seen[stage.use_learned])
-                _, _, circles = CapFit(min_score=0.5).process(case.frame, circles)
+                circles = judge.kept(case.frame, stage.process(*seen[stage.use_learned]))
                 scores[case.condition, name].add(circles, case.truth, counts)
     return judge.table(scores, [*nets, *((*CLASSIC, *FITTED) if peers else ())])
 
@@ -61,11 +59,10 @@ def simulated(models: list[Path], cache: Path, peers: bool) -> str:
 def both(frame: RgbdFrame, depth: bool) -> Circles:
     """Return the circles of network and classic detector, as graphs/pick.yaml has them."""
     net = CapNet(radius_px=(8, 60), min_score=0.05)
-    stage = PhaseHough(radius_px=(8, 80), min_score=judge.LEAST, use_learned=True, use_depth=depth)
+    least = judge.LEAST if depth else 0.5
+    stage = PhaseHough(radius_px=(8, 80), min_score=least, use_learned=True, use_depth=depth)
     circles = stage.process(frame, *net.process(frame))
-    if not depth:
-        return circles.take(circles.score >= 0.5)
-    return CapFit(min_score=0.5).process(frame, circles)[2]
+    return judge.kept(frame, circles) if depth else circles
 
 
 def real(model: Path, folder: Path) -> Iterator[str]:
