@@ -116,7 +116,9 @@ def run(
     ]
     more = ["foxglove"] if foxglove else []
     plan = _compile(graph, [*overrides, *(set_ or [])], source, more)
-    raise typer.Exit(execute(plan, manifest or manifest_path(plan), capsules).exit_code)
+    repeated = graph.suffix == ".mcap" and source is None  # its frame is saved already
+    report = execute(plan, manifest or manifest_path(plan), None if repeated else capsules)
+    raise typer.Exit(report.exit_code)
 
 
 @app.command()

@@ -85,9 +85,9 @@ def progress_bar(size: Callable[[], int] | None = None) -> Iterator[Any]:
 
 
 def execute(
-    plan: Plan, manifest: Path | None, capsules: Path, size: Callable[[], int] | None = None
+    plan: Plan, manifest: Path | None, capsules: Path | None, size: Callable[[], int] | None = None
 ) -> RunReport:
-    """Run a plan in front of a user; ``manifest`` None writes none, ``size`` see above."""
+    """Run a plan in front of a user; no ``manifest`` or ``capsules`` where None, ``size`` above."""
     source = plan.source.plugin
     spare(manifest, *(source.files() if isinstance(source, Source) else ()))
     stop = threading.Event()

@@ -22,12 +22,14 @@ _VECTORS = {
     "position_m": ("x_m", "y_m", "z_m"),
     "quaternion_xyzw": ("qx", "qy", "qz", "qw"),
     "axis": ("axis_x", "axis_y", "axis_z"),
+    "sigma_position_m": ("sigma_x_m", "sigma_y_m", "sigma_z_m"),
 }
 
 _HEADING = [
     *("stamp_ns", "sequence", "frame_id", "id", "u", "v", "radius_px"),
     *(*_VECTORS["position_m"], "distance_m", "diameter_m", *_VECTORS["quaternion_xyzw"]),
-    *(*_VECTORS["axis"], "score", "sigma_tilt_rad", "depth_source", "flags"),
+    *(*_VECTORS["axis"], "score", *_VECTORS["sigma_position_m"], "sigma_diameter_m"),
+    *("sigma_tilt_rad", "depth_source", "flags"),
 ]
 
 
@@ -46,8 +48,8 @@ def read_picks(path: Path, topic: str | None = None) -> Iterator[tuple[Header, P
             f"{path}: several topics hold picks: choose with --topic {' or --topic '.join(topics)}"
         )
     if topic not in (None, *topics) or not topics:
-        found = ", ".join(topics or sorted(index.channels)) or "nothing"
-        raise InputError(f"{path}: no picks on {topic or 'any topic'} (it holds {found})")
+        held = f"it holds {', '.join(topics)}" if topics else reader.contents()
+        raise InputError(f"{path}: no picks on {topic or 'any topic'} ({held})")
     for raw in reader.messages({topic or topics[0]}):
         try:
             decoded = decode_table(_SCHEMA, raw.message.data, raw.message.log_time)
@@ -73,6 +75,8 @@ def pick_rows(picks: Picks) -> list[dict[str, Any]]:
             "quaternion_xyzw": _vector(picks.quaternion[i]),
             "axis": _vector(picks.axis[i]),
             "score": float(picks.score[i]),
+            "sigma_position_m": _vector(picks.sigma_position[i]),
+            "sigma_diameter_m": _number(picks.sigma_diameter[i]),
             "sigma_tilt_rad": _number(picks.sigma_tilt[i]),
             "depth_source": DepthSource(int(picks.source[i])).name.lower(),
             "flags": [f.name.lower() for f in PickFlag(int(picks.flags[i])) if f.name],

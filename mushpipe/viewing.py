@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from enum import StrEnum
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -37,10 +38,13 @@ def figure(
     """Draw a figure of the paper from a frame of a result recording."""
     from mushpipe.console import set_up_logging
     from mushpipe.core.errors import UsageError
+    from mushpipe.core.overwriting import require_writable, spare
     from mushpipe.figure import KINDS, draw_pose
     from mushpipe.traces import read_manifest, read_trace
 
     set_up_logging(False)
+    spare(out, results)
+    require_writable(out)
     trace = read_trace(results, frame)
     if kind is FigureKind.pose:
         graph = read_manifest(results).get("graph", {})
@@ -93,11 +97,12 @@ def _play(file: Path, sink: RerunSink, stop: threading.Event) -> None:
     from mushpipe.core.stage import RunInfo
     from mushpipe.traces import read_manifest, read_traces
 
-    report = RunReport()
+    report, traces = RunReport(), read_traces(file)
+    first = next(traces, None)  # what has none fails here, before an .rrd is emptied for it
     sink.open(RunInfo(file.stem, read_manifest(file)))
     with progress_bar() as show:
         try:
-            for trace in read_traces(file):
+            for trace in chain([first] if first else [], traces):
                 if stop.is_set():
                     raise typer.Exit(EXIT_INTERRUPTED)
                 sink.consume(trace)

@@ -12,17 +12,22 @@ from mushpipe.core.errors import UsageError
 from mushpipe.core.plan import Node, Plan
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.recording import GRAPH, RecordingReader
+from mushpipe.core.stage import Source
 from mushpipe.core.types import RgbdFrame
 
 
 def write_capsule(folder: Path, plan: Plan, node: Node, frame: RgbdFrame, message: str) -> Path:
     """Write the frame on which a node failed, with the graph up to it, and return the path.
 
+    Its name says of which recording it is the frame, or with which stamp a camera took it.
     The graph keeps its stages, and of its sinks only a failing one: running a capsule must not
     reach a robot or write over results.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"failure-{node.name}-{frame.header.sequence}.mcap"
+    source = plan.source.plugin
+    name = source.name() if isinstance(source, Source) else ""
+    number = frame.header.sequence if plan.replay() else frame.header.stamp_ns
+    path = folder / f"failure-{name}-{node.name}-{number}.mcap"
     sinks = tuple(sink for sink in plan.sinks if sink.name == node.name)
     kept = replace(plan, sinks=sinks, on_error="fail")  # one frame: skipping it would show nothing
     metadata = {GRAPH: {"json": json.dumps(kept.resolved()), "failure": message}}

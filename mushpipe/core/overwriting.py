@@ -1,7 +1,9 @@
-"""What a command writes must be none of the files it reads."""
+"""What is written must be none of the files that are read, and must be possible to write."""
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from mushpipe.core.errors import UsageError
@@ -23,3 +25,45 @@ def spare(out: Path | None, *read: Path) -> None:
     for path in read:
         if out is not None and same_file(out, path):
             raise UsageError(f"{out} is what is read, and would be written over: give another name")
+
+
+def require_writable(out: Path | None) -> None:
+    """Find out before any work that its outcome cannot be written; touches nothing.
+
+    Raises:
+        UsageError: No file can be written at `out`.
+    """
+    if out is not None and (fault := _fault(out)):
+        raise UsageError(f"{out} cannot be written: {fault}")
+
+
+def spare_files(read: Iterable[Path], written: Mapping[str, Iterable[Path]]) -> None:
+    """Refuse what sinks could not write, or not without harm, before any of them opens.
+
+    Args:
+        read: Files of the source.
+        written: Files of each sink, by its name.
+
+    Raises:
+        UsageError: A sink would write over what is played or another sink's file, or cannot write.
+    """
+    taken = [("its own source", path) for path in read]
+    for name, paths in written.items():
+        for path in paths:
+            for whose, other in taken:
+                if same_file(path, other):
+                    raise UsageError(f"sink '{name}' would write over {whose} {path}")
+            if fault := _fault(path):
+                raise UsageError(f"sink '{name}': {path} cannot be written: {fault}")
+        taken += [(f"the file of sink '{name}',", path) for path in paths]
+
+
+def _fault(path: Path) -> str:
+    """Return why no file can be written at a path, "" where one can."""
+    if path.is_dir():
+        return "it is a folder"
+    if not path.parent.is_dir():
+        return f"there is no folder {path.parent}"
+    if not os.access(path if path.exists() else path.parent, os.W_OK):
+        return "permission denied"
+    return ""

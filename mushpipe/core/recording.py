@@ -150,6 +150,11 @@ class RecordingReader:
         others = [r for r in records if not isinstance(r, McapMessage)]
         return [*others, *sorted(messages, key=attrgetter("log_time"))]
 
+    def contents(self) -> str:
+        """Return its topics as text, for messages, and what of it could not be read."""
+        topics = ", ".join(sorted(self.index().channels)) or "nothing"
+        return f"it holds {topics}{'; ' if self.damage else ''}{'; '.join(self.damage)}"
+
     def _note(self, text: str) -> None:
         if text not in self.damage:
             self.damage.append(text)

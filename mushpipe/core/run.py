@@ -12,9 +12,9 @@ from pathlib import Path
 from mushpipe.core.capsule import write_capsule
 from mushpipe.core.chain import Chain, Passage, Turnstile, cores_shared, sink_inputs
 from mushpipe.core.edges import SinkThread, SourceThread, failure, interruptible_opening
-from mushpipe.core.errors import InputError, MushpipeError, StageError, UsageError
+from mushpipe.core.errors import InputError, MushpipeError, StageError
 from mushpipe.core.manifest import build_manifest
-from mushpipe.core.overwriting import same_file
+from mushpipe.core.overwriting import spare_files
 from mushpipe.core.plan import Node, Plan
 from mushpipe.core.report import Durations, RunReport
 from mushpipe.core.stage import Plugin, RunInfo, Sink, Source, Stage
@@ -87,7 +87,9 @@ class _Runner:
             durations = self.report.durations[self.plan.source.name]
             reader = SourceThread(self.plan.source, source, threading.Event(), durations)
             info = self._begin(source, reader)
-            for node in (*self.plan.stages, *self.plan.sinks):
+            # Who writes a file empties it: not before all that may fail without has opened.
+            sinks = sorted(self.plan.sinks, key=lambda node: bool(_files(node, info)))
+            for node in (*self.plan.stages, *sinks):
                 stack.enter_context(_opened(node, _opener(node, info)))
             threads = [self._sink_thread(node) for node in self.plan.sinks]
             stack.enter_context(cores_shared())
@@ -107,20 +109,8 @@ class _Runner:
             device = self.report.device = source.describe()
             manifest = {**self.report.manifest, **({"device": device} if device else {})}
             info = RunInfo(source.name(), manifest, source.live, lambda: reader.box.accepted)
-            self._spare_files(source, info)
+        spare_files(source.files(), {node.name: _files(node, info) for node in self.plan.sinks})
         return info
-
-    def _spare_files(self, source: Source, info: RunInfo) -> None:
-        """Raise UsageError where a sink would write over what is played, or another sink's file."""
-        taken = [("its own source", path) for path in source.files()]
-        for node in self.plan.sinks:
-            with _named(node):
-                files = node.plugin.files(info) if isinstance(node.plugin, Sink) else ()
-            for path in files:
-                for whose, other in taken:
-                    if same_file(path, other):
-                        raise UsageError(f"sink '{node.name}' would write over {whose} {path}")
-            taken += [(f"the file of sink '{node.name}',", path) for path in files]
 
     def _finish(self, threads: list[SinkThread]) -> None:
         """Tell the sinks how the run went; the first error of the run stays the one reported."""
@@ -265,6 +255,11 @@ class _Runner:
             logger.warning("the failing frame could not be saved: %s", trouble)
         else:
             self.report.capsules.append(str(path))
+
+
+def _files(node: Node, info: RunInfo) -> tuple[Path, ...]:
+    with _named(node):
+        return node.plugin.files(info) if isinstance(node.plugin, Sink) else ()
 
 
 def _opener(node: Node, info: RunInfo | None = None) -> Callable[[], None]:

@@ -20,6 +20,7 @@ from mushpipe.core.stage import resolve_path
 from mushpipe.core.tables import Floats
 
 UNIT_TOLERANCE = 1e-3
+REACH = 50.0  # m, of a robot from its camera
 
 
 class Transform(BaseModel):
@@ -34,6 +35,13 @@ class Transform(BaseModel):
     quaternion: tuple[float, float, float, float] = Field(
         description="rotation from the source frame to the target frame, x y z w"
     )
+
+    @field_validator("translation")
+    @classmethod
+    def _metres(cls, value: tuple[float, ...]) -> tuple[float, ...]:
+        if np.linalg.norm(value) > REACH:
+            raise ValueError(f"it is in m, and longer than {REACH:g} m: was it given in mm?")
+        return value
 
     @field_validator("quaternion")
     @classmethod

@@ -82,12 +82,13 @@ def calibrate_depth(
     seed: SeedOption = 0,
 ) -> None:
     """Find what `depth-correct` must take off, from planes at known distances."""
-    from mushpipe.core.overwriting import spare
+    from mushpipe.core.overwriting import require_writable, spare
     from mushpipe.evaluate.calibrate import fit_correction
     from mushpipe.evaluate.plane import judge_planes
     from mushpipe.evaluate.show import plane_table
 
     spare(out, *recordings)
+    require_writable(out)
     rows, _, _ = judge_planes(recordings, plane, [], resamples, seed)
     correction = fit_correction(rows, order)
     _print([plane_table(rows)])
@@ -133,8 +134,8 @@ def evaluate(
 def _judge(request: Request, out: Path | None, report: Path | None, output: Output) -> int:
     from mushpipe.evaluate.command import perform
 
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
+    for folder in filter(None, (out, report)):  # before the work that goes into them
+        folder.mkdir(parents=True, exist_ok=True)
     # Frames for the page may stand in the temporary results, so those live until it is written.
     with tempfile.TemporaryDirectory(prefix="mushpipe-eval-") as temporary:
         judgement = perform(request, out or Path(temporary), _run)

@@ -119,7 +119,7 @@ def read_results(path: Path, topic: str | None = None) -> Results:
     reader = RecordingReader(path)
     index = reader.index()
     manifest = json.loads(index.metadata.get(MANIFEST, {}).get("json", "{}"))
-    topic = _choose(path, index, topic)
+    topic = _choose(reader, index, topic)
     results = Results(path, topic, manifest=manifest)
     found: dict[tuple[int, int], tuple[Header, Detections]] = {}
     for raw in reader.messages({topic, TIMING_TOPIC}):
@@ -133,8 +133,9 @@ def read_results(path: Path, topic: str | None = None) -> Results:
     return results
 
 
-def _choose(path: Path, index: Index, topic: str | None) -> str:
+def _choose(reader: RecordingReader, index: Index, topic: str | None) -> str:
     """Return the topic to judge: the picks, or else the circles."""
+    path = reader.path
     groups = [
         sorted(t for t in index.channels if index.schema_name(t) == schema)
         for schema in (PICKS, CIRCLES)
@@ -143,8 +144,7 @@ def _choose(path: Path, index: Index, topic: str | None) -> str:
     if topic is not None and topic not in known:
         raise UsageError(f"{path}: nothing to judge on '{topic}'; {suggest(topic, known)}")
     if not known:
-        found = ", ".join(sorted(index.channels)) or "nothing"
-        raise InputError(f"{path}: no picks or circles to judge (it holds {found})")
+        raise InputError(f"{path}: no picks or circles to judge ({reader.contents()})")
     candidates = groups[0] or groups[1]
     if topic is None and len(candidates) > 1:
         raise UsageError(f"{path}: choose with --topic {' or --topic '.join(candidates)}")

@@ -93,11 +93,13 @@ def bench(
     from mushpipe.core.document import read_document
     from mushpipe.core.errors import EXIT_DIFFERS
     from mushpipe.core.graph import compile_document
+    from mushpipe.core.overwriting import require_writable
     from mushpipe.core.plugins import load_registry
     from mushpipe.proof.bench import bench as measure
     from mushpipe.proof.bench import read_baseline, slower
 
     set_up_logging(False)
+    require_writable(out)
     before = read_baseline(baseline) if baseline else None
     plan = compile_document(read_document(graph), load_registry(), set_ or [], recording)
     result = measure(lambda count: _endless(plan, count, speed), frames)

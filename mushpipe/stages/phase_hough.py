@@ -107,6 +107,8 @@ class PhaseHough(Stage):
             value = getattr(self, name)
             if value is not None and value[0] >= value[1]:
                 raise ValueError(f"{name} must be [smallest, largest]")
+        if self.diameter_mm[1] < 1:
+            raise ValueError("diameter_mm is in mm, and below 1 mm: was it given in m?")
         return self
 
     def open(self) -> None:

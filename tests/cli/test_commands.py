@@ -25,6 +25,8 @@ PICK_KEYS = [
     "quaternion_xyzw",
     "axis",
     "score",
+    "sigma_position_m",
+    "sigma_diameter_m",
     "sigma_tilt_rad",
     "depth_source",
     "flags",
@@ -180,7 +182,7 @@ def test_a_failing_stage_leaves_a_capsule_that_fails_again(folder: Path) -> None
     assert done.returncode == EXIT_FAILED
     assert "failed on frame 1: RuntimeError: no frame like this" in done.stderr
     assert "1 failed" in done.stderr
-    again = mushpipe("run", "failures/failure-segment-1.mcap", cwd=folder)
+    again = mushpipe("run", "failures/failure-synthetic-bed-0-segment-1.mcap", cwd=folder)
     assert again.returncode == EXIT_FAILED
     assert "failed on frame 1: RuntimeError: no frame like this" in again.stderr
 
@@ -268,6 +270,42 @@ def test_no_command_writes_over_what_it_reads(folder: Path) -> None:
         assert done.returncode == EXIT_USAGE, done.stderr
         assert "b.mcap is what is read, and would be written over" in done.stderr
         assert (folder / "a.mcap").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ("{use: robot-json, port: 5005}", "set 'replay: true' to serve it"),
+        ("{use: mcap, path: .}", "sink 'other': {folder} cannot be written: it is a folder"),
+    ],
+)
+def test_results_are_kept_where_another_sink_cannot_open(
+    folder: Path, settings: str, message: str
+) -> None:
+    text = (folder / "graph.yaml").read_text()
+    (folder / "graph.yaml").write_text(text + f"  other: {settings}\n")
+    (folder / "out.mcap").write_text("of yesterday")
+    done = mushpipe("run", "graph.yaml", cwd=folder)
+    assert done.returncode == EXIT_USAGE
+    assert message.format(folder=folder) in done.stderr
+    assert (folder / "out.mcap").read_text() == "of yesterday"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("bench", "graph.yaml", "--json", "none/a.json"),
+        ("calibrate", "depth", "a.mcap", "--plane", "0.5", "-o", "none/a.json"),
+        ("figure", "a.mcap", "-o", "none/a.json"),
+    ],
+)
+def test_where_nothing_can_be_written_no_work_begins(
+    folder: Path, arguments: tuple[str, ...]
+) -> None:
+    done = mushpipe(*arguments, cwd=folder)
+    assert done.returncode == EXIT_USAGE
+    assert done.stdout == ""
+    assert done.stderr == "error: none/a.json cannot be written: there is no folder none\n"
 
 
 def test_a_file_that_cannot_be_written_is_named(folder: Path) -> None:

@@ -50,6 +50,15 @@ def test_a_damaged_file_is_shown_as_far_as_it_goes(tmp_path: Path) -> None:
     assert entities(out)["/camera/image/color"] == 1
 
 
+def test_what_shows_nothing_leaves_an_earlier_file_alone(tmp_path: Path) -> None:
+    path, out = record(tmp_path / "a.mcap", [trace_of(make_frame())]), tmp_path / "a.rrd"
+    path.write_bytes(path.read_bytes()[:200])
+    out.write_text("an earlier one")
+    result = CliRunner().invoke(app, ["view", str(path), "--save", str(out)])
+    assert isinstance(result.exception, InputError)
+    assert out.read_text() == "an earlier one"
+
+
 def test_without_a_display_it_says_what_to_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

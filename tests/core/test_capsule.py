@@ -50,7 +50,7 @@ def again(lab: Lab, path: str):
 
 def test_a_capsule_repeats_the_failure(lab: Lab, graph: str):
     first = lab.run(graph, "a.level=2", capsules=lab.folder / "failures")
-    assert first.capsules == [str(lab.folder / "failures" / "failure-b-2.mcap")]
+    assert first.capsules == [str(lab.folder / "failures" / "failure-rich-b-2.mcap")]
     lab.seen.clear()
     second = again(lab, first.capsules[0])
     assert str(second.error) == str(first.error)
@@ -65,15 +65,16 @@ def test_the_program_repeats_the_failure(lab: Lab, graph: str, monkeypatch, caps
     (lab.folder / "graph.yaml").write_text(graph)
     assert cli(monkeypatch, "run", "graph.yaml") == 1
     first = capsys.readouterr().err
-    assert "mushpipe run failures/failure-b-2.mcap repeats the failure" in first
-    assert cli(monkeypatch, "run", "failures/failure-b-2.mcap") == 1
+    assert "mushpipe run failures/failure-rich-b-2.mcap repeats the failure" in first
+    assert cli(monkeypatch, "run", "failures/failure-rich-b-2.mcap") == 1
     error = first[first.index("error: ") :]
     assert capsys.readouterr().err.endswith(error)
+    assert len([*(lab.folder / "failures").iterdir()]) == 1
 
 
 def test_a_capsule_keeps_the_resolved_graph_without_its_sinks(lab: Lab, graph: str):
     report = lab.run(graph, "a.level=2", capsules=lab.folder)
-    document = capsule_document(lab.folder / "failure-b-2.mcap")
+    document = capsule_document(lab.folder / "failure-rich-b-2.mcap")
     assert document.data["source"] == {"use": "mcap", "path": report.capsules[0]}
     assert document.data["stages"]["a"] == {"use": "threshold", "level": 2, "band": None}
     assert (document.data["seed"], document.data["sinks"]) == (3, {})
@@ -87,7 +88,29 @@ def test_a_capsule_of_a_skipping_run_does_not_skip(lab: Lab, graph: str):
 
 def test_one_capsule_per_plugin_is_enough(lab: Lab):
     text = lab.chain("fussy", extra="on_error: skip").replace("fussy", "fussy, on: [0, 1, 2]")
-    assert lab.run(text, capsules=lab.folder).capsules == [str(lab.folder / "failure-a-0.mcap")]
+    assert lab.run(text, capsules=lab.folder).capsules == [
+        str(lab.folder / "failure-frames-a-0.mcap")
+    ]
+
+
+def test_the_same_frame_of_two_recordings_makes_two_capsules(lab: Lab):
+    class Other(Frames):
+        def name(self) -> str:
+            return "other"
+
+    lab.registry.source("other", Other)
+    for source in ("frames", "other"):
+        text = lab.chain("fussy", source=source).replace("fussy", "fussy, on: [0]")
+        lab.run(text, capsules=lab.folder)
+    names = sorted(path.name for path in lab.folder.glob("failure-*"))
+    assert names == ["failure-frames-a-0.mcap", "failure-other-a-0.mcap"]
+
+
+def test_a_camera_begins_counting_again_so_its_capsules_carry_the_stamp(lab: Lab):
+    lab.live(lambda: iter([make_frame(0)]))
+    text = lab.chain("fussy", source="live", extra="on_error: fail")
+    report = lab.run(text.replace("fussy", "fussy, on: [0]"), capsules=lab.folder)
+    assert report.capsules[0].endswith(f"-a-{10**9}.mcap")
 
 
 def test_a_name_that_begins_like_another_gets_its_own_capsule(lab: Lab):
@@ -95,7 +118,7 @@ def test_a_name_that_begins_like_another_gets_its_own_capsule(lab: Lab):
     stages = ["  a: {use: fussy, on: [1]}", "  a-2: {use: fussy, on: [0]}"]
     report = lab.run("\n".join([*text[:4], *stages]), capsules=lab.folder)
     names = [path.rpartition("/")[2] for path in report.capsules]
-    assert names == ["failure-a-2-0.mcap", "failure-a-1.mcap"]
+    assert names == ["failure-frames-a-2-0.mcap", "failure-frames-a-1.mcap"]
 
 
 def test_no_folder_no_capsule(lab: Lab, graph: str):
@@ -111,7 +134,7 @@ def test_a_failing_sink_stays_in_its_capsule(lab: Lab, graph: str):
     text = graph.replace("own-b", "fussy") + "\n"
     text = text.replace("{out: {use: collect}}", "{out: {use: full}, other: {use: collect}}")
     first = lab.run(text, capsules=lab.folder)
-    document = capsule_document(lab.folder / "failure-out-0.mcap")
+    document = capsule_document(lab.folder / "failure-rich-out-0.mcap")
     assert document.data["sinks"] == {"out": {"use": "full"}}
     assert str(again(lab, first.capsules[0]).error) == str(first.error)
 

@@ -134,7 +134,7 @@ def test_a_later_frame_that_fails_first_does_not_count_before_its_turn(lab: Lab,
     assert str(report.error).endswith("failed on frame 2: RuntimeError: the earlier one")
     assert (report.processed, report.failed) == (2, 1)
     assert report.balanced()
-    assert [path.name for path in tmp_path.iterdir()] == ["failure-b-2.mcap"]
+    assert [path.name for path in tmp_path.iterdir()] == ["failure-frames-b-2.mcap"]
 
 
 @pytest.mark.parametrize("at", range(4))

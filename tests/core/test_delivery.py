@@ -122,7 +122,7 @@ def test_a_failing_sink_ends_a_replay(lab: Lab, tmp_path):
     assert report.exit_code == 1
     assert report.processed < 1000
     assert report.balanced()
-    assert report.capsules == [str(tmp_path / "failure-out-1.mcap")]
+    assert report.capsules == [str(tmp_path / "failure-frames-out-1.mcap")]
 
 
 def test_a_sink_that_wants_to_leave_does_not_hang_the_run(lab: Lab):

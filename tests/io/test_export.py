@@ -17,7 +17,8 @@ from tests.io.values import make_circles, make_frame, make_picks, no_picks, reco
 COLUMNS = [
     *("stamp_ns", "sequence", "frame_id", "id", "u", "v", "radius_px", "x_m", "y_m", "z_m"),
     *("distance_m", "diameter_m", "qx", "qy", "qz", "qw", "axis_x", "axis_y", "axis_z", "score"),
-    *("sigma_tilt_rad", "depth_source", "flags"),
+    *("sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_diameter_m", "sigma_tilt_rad"),
+    *("depth_source", "flags"),
 ]
 
 
@@ -54,6 +55,8 @@ def test_ndjson_is_one_line_per_frame_with_null_where_unknown(results: Path) -> 
             "quaternion_xyzw": [0.0, 0.0, 0.6, 0.8],
             "axis": [0.0, 0.0, 1.0],
             "score": 0.9,
+            "sigma_position_m": [0.001, 0.002, 0.003],
+            "sigma_diameter_m": 0.0015,
             "sigma_tilt_rad": 0.1,
             "depth_source": "neighbours",
             "flags": ["depth_estimated"],
@@ -69,6 +72,8 @@ def test_ndjson_is_one_line_per_frame_with_null_where_unknown(results: Path) -> 
             "quaternion_xyzw": None,
             "axis": None,
             "score": 0.25,
+            "sigma_position_m": None,
+            "sigma_diameter_m": None,
             "sigma_tilt_rad": None,
             "depth_source": "missing",
             "flags": ["depth_missing", "pose_unknown", "at_border"],
@@ -85,7 +90,8 @@ def test_csv_is_one_line_per_pick_with_empty_fields_where_unknown(results: Path)
     assert float(second["radius_px"]) == 1 / 3
     assert {k for k, v in second.items() if v == ""} == {
         *("x_m", "y_m", "z_m", "distance_m", "diameter_m", "qx", "qy", "qz", "qw"),
-        *("axis_x", "axis_y", "axis_z", "sigma_tilt_rad"),
+        *("axis_x", "axis_y", "axis_z", "sigma_x_m", "sigma_y_m", "sigma_z_m"),
+        *("sigma_diameter_m", "sigma_tilt_rad"),
     }
     assert second["flags"] == "depth_missing|pose_unknown|at_border"
 
@@ -161,3 +167,9 @@ def test_a_message_that_is_no_table_is_refused(text: bytes, tmp_path: Path) -> N
         writer.finish()
     with pytest.raises(InputError, match="a pick message cannot be read"):
         list(ndjson_lines(path))
+
+
+def test_of_a_file_that_breaks_off_it_says_so(results: Path) -> None:
+    results.write_bytes(results.read_bytes()[:200])
+    with pytest.raises(InputError, match="it holds nothing; it breaks off"):
+        list(csv_lines(results))

@@ -59,8 +59,8 @@ def make_picks() -> Picks:
         quaternion=np.array([[0, 0, 0.6, 0.8], [NAN] * 4]),
         axis=np.array([[0, 0, 1.0], [NAN] * 3]),
         score=np.array([0.9, 0.25]),
-        sigma_position=np.full((2, 3), NAN),
-        sigma_diameter=np.full(2, NAN),
+        sigma_position=np.array([[0.001, 0.002, 0.003], [NAN] * 3]),
+        sigma_diameter=np.array([0.0015, NAN]),
         sigma_tilt=np.array([0.1, NAN]),
         source=np.array([DepthSource.NEIGHBOURS, DepthSource.MISSING]),
         flags=np.array(

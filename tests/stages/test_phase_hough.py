@@ -165,5 +165,10 @@ def test_ranges_the_wrong_way_round_are_refused() -> None:
         PhaseHough(diameter_mm=(60, 20))
 
 
+def test_diameters_in_metres_are_refused() -> None:
+    with pytest.raises(ValueError, match="was it given in m"):
+        PhaseHough(diameter_mm=(0.008, 0.12))
+
+
 def test_it_is_registered() -> None:
     assert "phase-hough" in load_registry().names("stage")
