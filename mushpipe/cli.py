@@ -129,6 +129,7 @@ def validate(
     output: OutputOption = Output.text,
 ) -> None:
     """Check a graph file without running it; report every fault at once."""
+    import logging
     from dataclasses import asdict
 
     from mushpipe.core.errors import GraphError
@@ -140,8 +141,12 @@ def validate(
             _out(json.dumps({"problems": [asdict(problem) for problem in error.problems]}))
             raise typer.Exit(error.exit_code) from None
         raise
+    missing = plan.missing_files()  # which another machine may have
+    for text in missing:
+        logging.getLogger("mushpipe").warning(text)
     if output is Output.json:
-        _out(json.dumps({"problems": [], "warnings": plan.warnings, "graph": plan.resolved()}))
+        warnings = [*plan.warnings, *missing]
+        _out(json.dumps({"problems": [], "warnings": warnings, "graph": plan.resolved()}))
     else:
         _out(f"{graph}: {len(plan.stages)} stages, {len(plan.sinks)} sinks, no faults")
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from mushpipe.core.stage import Kind, Plugin, Ports, Sink, Source
+from mushpipe.core.stage import STDIO, Kind, Plugin, Ports, Sink, Source
 
 
 class Link(NamedTuple):
@@ -88,6 +89,15 @@ class Plan:
     def replay(self) -> bool:
         """Return whether the source can be played again."""
         return not (isinstance(self.source.plugin, Source) and self.source.plugin.live)
+
+    def missing_files(self) -> list[str]:
+        """Return, in words, what source and stages are to read and what is not there."""
+        return [
+            f"{node.name}: there is no file {value} ({name})"
+            for node in (self.source, *self.stages)
+            for name, value in node.plugin
+            if isinstance(value, Path) and value != STDIO and not value.exists()
+        ]
 
     def delivery(self, sink: Node) -> Literal["every", "latest"]:
         """Return how a sink is fed; a replay never drops."""
