@@ -145,7 +145,8 @@ def _last(trace: Trace, kind: type[T]) -> T:
     if not found:
         raise UsageError(
             f"frame {trace.frame.header.sequence} has no {kind.__name__}: the graph that wrote the "
-            "results has no stage that makes them, or the frame failed"
+            "results has no stage that makes them, the frame failed, or the file breaks off there "
+            "(mushpipe info tells)"
         )
     return found[-1]
 
