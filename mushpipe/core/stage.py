@@ -10,10 +10,11 @@ from dataclasses import dataclass
 from inspect import Parameter, signature
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo
+from pydantic.fields import FieldInfo
 
 from mushpipe.core.errors import PluginError
 from mushpipe.core.types import RgbdFrame
@@ -71,6 +72,13 @@ class RunInfo:
         path = Path(str(template).replace("{recording}", self.recording))
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
+
+
+def _is_written(setting: FieldInfo) -> bool:
+    """Whether a setting is a `SinkPath`, or that or None."""
+    alternatives = (getattr(kind, "__metadata__", ()) for kind in get_args(setting.annotation))
+    validators = (each for group in (setting.metadata, *alternatives) for each in group)
+    return any(getattr(each, "func", None) is only_recording for each in validators)
 
 
 class Plugin(BaseModel):
@@ -165,9 +173,9 @@ class Sink(Plugin):
         """Open files and sockets: once per run, before the first frame."""
 
     def files(self, run: RunInfo) -> tuple[Path, ...]:
-        """Return the files it writes."""
-        del run
-        return ()
+        """Return the files it writes; if not overridden, those of settings of type `SinkPath`."""
+        paths = (getattr(self, n) for n, f in type(self).model_fields.items() if _is_written(f))
+        return tuple(run.path(path) for path in paths if path not in (None, STDIO))
 
     def finish(self, summary: Mapping[str, Any]) -> None:
         """Take the run's counts and timings, after the last frame and before `close`."""

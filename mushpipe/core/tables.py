@@ -17,9 +17,15 @@ Floats = NDArray[np.float64]
 
 
 def locked(array: Any, dtype: Any) -> NDArray[Any]:
-    """Return the array as C-contiguous dtype, read-only; itself where nothing needs converting."""
+    """Return the array as C-contiguous dtype, read-only; itself where nothing needs converting.
+
+    What it is a view of becomes read-only too, or it could still change.
+    """
     result: NDArray[Any] = np.require(array, dtype, ["C_CONTIGUOUS"])
-    result.flags.writeable = False
+    part: Any = result
+    while isinstance(part, np.ndarray):
+        part.flags.writeable = False
+        part = part.base
     return result
 
 
@@ -153,6 +159,7 @@ class Locations(Columns):
 
     def check(self) -> None:
         """A position is finite exactly where its source is not missing; sizes are positive."""
+        self._require(self.source <= max(DepthSource), "the source must be a DepthSource")
         present = self.source != DepthSource.MISSING
         self._require(_known(self.position) == present, "position must be NaN where missing")
         self._require(_known(self.distance) == present, "distance must be NaN where missing")
@@ -204,7 +211,7 @@ class Picks(Columns):
         quaternion: (N, 4) x y z w.
         axis: (N, 3) unit cap normal.
         score: (N,) 0..1.
-        sigma_position: (N, 3) m one sigma.
+        sigma_position: (N, 3) m one sigma, of `position`.
         sigma_diameter: (N,) m one sigma.
         sigma_tilt: (N,) rad one sigma.
         source: (N,) `DepthSource` of the position.

@@ -164,16 +164,18 @@ def _unanswered(judged: Judged) -> list[Place]:
 
 
 def find_truth(results: Results) -> TruthSet:
-    """Return the truth of results: their own, or that of the recording they were made from.
+    """Return the truth of the recording that results were made from, or what they hold of it.
+
+    The results' own copy lacks the frames that failed, so it is the second choice.
 
     Raises:
         InputError: Neither is to be found; a recording counts only with the SHA-256 that the
             results state.
     """
-    if has_truth(results.path):
-        return read_truth(results.path)
     stated = results.manifest.get("recordings") or [{}]
     path = source_recording(results.path, results.manifest)
+    if (path is None or not has_truth(path)) and has_truth(results.path):
+        return read_truth(results.path)
     if path is None:
         of = f" of {stated[0]['file']}" if stated[0].get("file") else ""
         raise InputError(f"{results.path}: the truth{of} is not to be found; give it with --truth")

@@ -148,8 +148,10 @@ class Connection:
 
     def _send(self, outgoing: Outgoing, now: float) -> None:
         self._observe("tx", self.number, outgoing.data)
-        self._out, self._expires = memoryview(outgoing.data), outgoing.expires
-        self._progress = now
+        self._out, self._progress = memoryview(outgoing.data), now
+        # It was good when it was made; that nothing of it is taken then is the client's doing.
+        self._expires = None if outgoing.expires is None else max(outgoing.expires, now)
+        self._flush(now)
 
     def _take(self, now: float) -> bytes | None:
         """Return the next whole line, or what is already too long for one."""

@@ -131,7 +131,10 @@ class Player:
 
     def _take(self, raw: Raw, pairing: Pairing[_Color, _Depth]) -> Iterator[RgbdFrame]:
         if raw.channel.topic == self.topics.camera:
-            self.camera = self.calibration(raw, "calibrations") or self.camera
+            unread = self.counts.total()
+            camera = self.calibration(raw, "calibrations")
+            if self.counts.total() == unread:  # None says here that there is none any more
+                self.camera = camera
         elif raw.channel.topic == self.topics.depth:
             depth = self._decode(raw, self._depth)
             if depth:

@@ -17,6 +17,7 @@ from mushpipe.stages.tracks import Tracks
 
 logger = logging.getLogger("mushpipe")
 SMALLEST_MM = 1.0
+HEIGHT = 0.3  # of a usual cap, in diameters
 Rank = Literal["unoccluded", "highest", "largest", "score"]
 FlagName = Literal[
     "depth_missing",
@@ -93,12 +94,13 @@ class MakePicks(Stage):
         """Return the picks, the first to pick first, in the robot's frame or the camera's.
 
         Raises:
-            ValueError: The inputs differ in their number of rows.
+            ValueError: The inputs differ in their number of rows, or are of different circles.
         """
         n = len(circles)
         poses = poses or Poses.unknown(n)
         if not n == len(locations) == len(poses):
             raise ValueError(f"{n} circles, {len(locations)} locations, {len(poses)} poses")
+        _require_same(circles, locations, frame)
         self._total += n
         self._missing += int((locations.source == DepthSource.MISSING).sum())
         height, width = frame.color.shape[:2]
@@ -174,10 +176,39 @@ class MakePicks(Stage):
             )
         if self._missing:
             logger.warning(
-                "%d of %d mushrooms have no position: there is no depth at them",
+                "%d of %d mushrooms have no position: there is no depth at them, or none that fits",
                 self._missing,
                 self._total,
             )
+
+
+def _require_same(circles: Circles, locations: Locations, frame: RgbdFrame) -> None:
+    """Raise ValueError where a location is not seen in its circle: rows were mixed up."""
+    if frame.camera is None:
+        return
+    seen = frame.camera.project(locations.position)
+    away = np.linalg.norm(seen - circles.center, axis=1) > 2 * circles.radius
+    if away.any():
+        row = int(np.flatnonzero(away)[0])
+        (u, v), (x, y) = circles.center[row], seen[row]
+        raise ValueError(
+            f"row {row}: the circle is at ({u:.0f}, {v:.0f}), its location at ({x:.0f}, {y:.0f}): "
+            "circles and locations must come from one chain; what sorts or filters circles "
+            "belongs before the localizer"
+        )
+
+
+def _sigma_position(locations: Locations, poses: Poses) -> NDArray[np.float64]:
+    """Return the sigma (N, 3), m, of the apex where there is a pose, of the surface point else.
+
+    A cap that leans by an angle more than was found, about its middle, has its apex farther by
+    that angle times its height, in any direction across its axis n: the covariance is
+    (height sigma)^2 (I - n n^T) / 2, sigma being that of the whole angle.
+    """
+    height = HEIGHT * locations.diameter
+    across = 0.5 * (height * poses.sigma_rad)[:, None] ** 2 * (1 - poses.axis**2)
+    apex = np.sqrt(locations.sigma_position**2 + across)
+    return np.where(poses.valid[:, None], apex, locations.sigma_position)
 
 
 def _joined(
@@ -200,7 +231,7 @@ def _joined(
         quaternion=poses.quaternion,
         axis=poses.axis,
         score=circles.score,
-        sigma_position=locations.sigma_position,
+        sigma_position=_sigma_position(locations, poses),
         sigma_diameter=locations.sigma_diameter,
         sigma_tilt=poses.sigma_rad,
         source=locations.source,

@@ -53,6 +53,27 @@ def test_no_command_writes_over_what_it_reads(folder: Path) -> None:
         assert (folder / "a.mcap").read_bytes() == before
 
 
+def test_a_sink_of_ones_own_is_kept_from_its_source_by_the_type_of_its_path(folder: Path) -> None:
+    (folder / "mine.py").write_text(
+        "from mushpipe import Circles, RunInfo, Sink, SinkPath\n\n"
+        "class Lines(Sink):\n"
+        "    path: SinkPath | None = None\n"
+        "    def open(self, run: RunInfo) -> None:\n"
+        "        run.path(self.path).write_text('')\n"
+        "    def consume(self, circles: Circles) -> None:\n"
+        "        pass\n"
+    )
+    text = (folder / "graph.yaml").read_text()
+    own = "  mine: {use: ./mine.py:Lines, path: ./a.mcap}\n"
+    (folder / "graph.yaml").write_text(text + own)
+    mushpipe("record", "--source", "synthetic", "--frames", 1, "-o", "a.mcap", cwd=folder)
+    before = (folder / "a.mcap").read_bytes()
+    done = mushpipe("run", "graph.yaml", "--source", "a.mcap", cwd=folder)
+    assert done.returncode == EXIT_USAGE
+    assert "sink 'mine' would write over its own source" in done.stderr
+    assert (folder / "a.mcap").read_bytes() == before
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

@@ -118,6 +118,7 @@ WRONG = [
         "Locations: position must be NaN where missing (row 1)",
     ),
     (locations, {"distance": [NAN, NAN]}, "Locations: distance must be NaN where missing (row 0)"),
+    (locations, {"source": [3, 0]}, "Locations: the source must be a DepthSource (row 0)"),
     (locations, {"diameter": [0, NAN]}, "Locations: the diameter must be positive or NaN (row 0)"),
     (
         poses,
@@ -208,6 +209,13 @@ def test_locked_keeps_what_fits_and_copies_what_does_not():
     assert turned.flags.c_contiguous
     assert np.array_equal(turned, array.T)
     assert locked([1, 2], np.uint8).dtype == np.uint8
+
+
+def test_what_a_view_is_of_is_locked_too():
+    buffer = np.zeros((3, 4, 5))
+    locked(buffer[1], np.float64)
+    with pytest.raises(ValueError, match="read-only"):
+        buffer[1, 0, 0] = 1
 
 
 def test_instances():

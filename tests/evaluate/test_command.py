@@ -98,6 +98,23 @@ def test_truth_is_found_in_the_recording_the_results_name(
     assert metrics(judged(results, "--truth", write_recording(recording, truths)))["f"] == 1
 
 
+def test_a_frame_that_failed_is_missed_though_the_results_copy_no_truth_of_it(
+    tmp_path: Path, truths: dict[int, Any]
+) -> None:
+    recording = write_recording(tmp_path / "bed.mcap", truths)
+    sha256 = hashlib.sha256(recording.read_bytes()).hexdigest()
+    manifest = {
+        "graph": {"source": {"use": "mcap", "path": "bed.mcap"}},
+        "recordings": [{"file": "bed.mcap", "sha256": sha256}],
+    }
+    kept = {i: truths[i] for i in (0, 2)}
+    answers = {i: picks_of(truth) for i, truth in kept.items()}
+    results = write_results(tmp_path / "r.mcap", answers, kept, manifest=json.dumps(manifest))
+    assert metrics(judged(results))["recall"] == pytest.approx(2 / 3)
+    recording.unlink()  # what the results hold is better than nothing
+    assert metrics(judged(results))["recall"] == 1
+
+
 def test_labels_judge_the_frames_they_name(tmp_path: Path, truths: dict[int, Any]) -> None:
     answers = {i: picks_of(truth) for i, truth in truths.items()}
     results = write_results(tmp_path / "r.mcap", answers)

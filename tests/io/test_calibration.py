@@ -121,6 +121,18 @@ def test_a_calibration_that_changes_is_followed(tmp_path: Path) -> None:
     assert [camera.fx for camera in found if camera] == [FX, 99]
 
 
+def test_from_a_calibration_that_says_there_is_none_there_is_none(tmp_path: Path) -> None:
+    entries = [
+        info_at(0),
+        color_at(0),
+        info_at(1, k=(0,) * 9),
+        color_at(1),
+        info_at(2),
+        color_at(2),
+    ]
+    assert cameras(tmp_path, entries) == [CALIBRATED, None, CALIBRATED]
+
+
 @pytest.mark.parametrize("start", [1.5 * PERIOD, 2 * PERIOD])
 def test_a_start_after_the_change_uses_the_later_calibration(start: float, tmp_path: Path) -> None:
     changed = info_at(1, k=(99, 0, 1, 0, 99, 1, 0, 0, 1))

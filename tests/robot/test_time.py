@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import socket
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from mushpipe.robot.clock import MEMORY_S, TOLERANCE_S, Clock, Placer
-from mushpipe.robot.hub import Hub, Settings
+from mushpipe.robot.connection import Connection, Limits
+from mushpipe.robot.hub import Ending, Hub, Settings
 from mushpipe.robot.ledger import FORGET_S, Ledger
 from mushpipe.robot.messages import Refusal
+from mushpipe.robot.session import Outgoing
 from tests.robot.scene import FakeClock, choice
 
 
@@ -177,3 +181,40 @@ def test_a_target_can_be_kept_away_for_a_while() -> None:
     assert ledger.apply("a", 1, "rejected", 5, visible=True, now=0) == "removed"
     ledger.settle(5)
     assert ledger.hidden() == set()
+
+
+class Ageing(FakeClock):
+    """A clock of a computer on which looking at it takes a millisecond."""
+
+    def monotonic(self) -> float:
+        self.now += 0.001
+        return self.now
+
+
+class LastMoment:
+    """A session whose line may leave at this moment, and not after it."""
+
+    ready, closing, terminators = True, False, b"\n"
+
+    def handle(self, line: bytes, now: float) -> Outgoing | None:
+        return Outgoing(b"targets\n", expires=now)
+
+    def due(self, now: float) -> Outgoing | None:
+        return None
+
+    def refuse(self, refusal: Refusal, now: float) -> Outgoing:
+        raise refusal
+
+    def leave(self, reason: Ending) -> None:
+        pass
+
+
+def test_a_client_that_reads_is_not_cut_off_for_targets_that_age_while_they_are_sent() -> None:
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        ours.setblocking(False)
+        theirs.sendall(b"ask\n")
+        connection = Connection(ours, LastMoment(), 1, Limits(), lambda *_: None, Ageing())
+        connection.serve()
+        assert theirs.recv(100) == b"targets\n"
+        assert not connection.gone

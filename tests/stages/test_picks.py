@@ -21,11 +21,12 @@ def circles_at(*centers: tuple[float, float], radius: float = 8.0) -> Circles:
     return Circles(np.reshape(centers, (n, 2)), np.full(n, radius), np.ones(n))
 
 
-def locations(*sources: DepthSource) -> Locations:
+def locations(*sources: DepthSource, at: tuple[float, ...] = (50, 80)) -> Locations:
+    """Surface points 0.5 m deep, seen at v = 50 px and `at` px."""
     n = len(sources)
     present = np.array(sources) != DepthSource.MISSING
-    position = np.where(present[:, None], [[0.01, 0.02, 0.5]], NAN)
-    position[:, 0] += 0.1 * np.arange(n)
+    pixels = np.array([(u, 50.0) for u in at[:n]]).reshape(n, 2)
+    position = np.where(present[:, None], CAMERA.deproject(pixels, np.full(n, 0.5)), NAN)
     return Locations(
         position,
         np.linalg.norm(position, axis=1),
@@ -38,9 +39,8 @@ def locations(*sources: DepthSource) -> Locations:
 
 def test_flags_say_what_is_not_measured() -> None:
     circles = circles_at((50, 50), (80, 50), (110, 50), (4, 50))
-    found = locations(
-        DepthSource.MEASURED, DepthSource.NEIGHBOURS, DepthSource.MISSING, DepthSource.MEASURED
-    )
+    sources = (DepthSource.MEASURED, DepthSource.NEIGHBOURS, DepthSource.MISSING)
+    found = locations(*sources, DepthSource.MEASURED, at=(50, 80, 110, 4))
     picks = MakePicks().process(frame_of(np.zeros((120, 160))), circles, found)
     unknown = PickFlag.POSE_UNKNOWN
     flags = picks.flags[np.argsort(picks.id)].tolist()
@@ -67,8 +67,40 @@ def test_the_apex_stands_in_for_the_surface_only_where_the_pose_is_valid() -> No
     )
     found = locations(DepthSource.MEASURED, DepthSource.MEASURED)
     picks = MakePicks().process(frame_of(np.zeros((120, 160))), circles, found, poses)
-    assert picks.position.tolist() == [[0.0, 0.0, 0.48], [0.11, 0.02, 0.5]]
+    assert picks.position.tolist() == [[0.0, 0.0, 0.48], found.position[1].tolist()]
     assert [bool(f & PickFlag.POSE_UNKNOWN) for f in picks.flags] == [False, True]
+
+
+def test_the_sigma_of_a_position_is_that_of_the_apex_where_there_is_one() -> None:
+    rng, n, sigma_deg = np.random.default_rng(0), 20000, 12.0
+    axis, height, surface = np.array([0.48, 0.0, -0.8773]), 0.012, 0.0008
+    axis /= np.linalg.norm(axis)
+    lean = rng.normal(0, np.radians(sigma_deg) / np.sqrt(2), (n, 2))  # the angle is their length
+    sides = np.stack([np.cross(axis, [0, 1, 0]), [0, 1, 0]])
+    apexes = height * (axis + lean @ sides) + rng.normal(0, surface, (n, 3))
+    found = replace(
+        locations(DepthSource.MEASURED, DepthSource.MEASURED),
+        sigma_position=np.full((2, 3), surface),
+    )
+    poses = Poses(
+        quaternion=[[*Rotation.align_vectors([axis], [[0, 0, 1]])[0].as_quat()], [NAN] * 4],
+        axis=[axis, [NAN] * 3],
+        apex=[[0.0, 0.0, 0.48], [NAN] * 3],
+        sigma_rad=[np.radians(sigma_deg), NAN],
+        fitness=[1.0, NAN],
+        valid=[True, False],
+    )
+    circles = circles_at((50, 50), (80, 50))
+    picks = MakePicks().process(frame_of(np.zeros((120, 160))), circles, found, poses)
+    picks = picks.take(np.argsort(picks.id))
+    np.testing.assert_allclose(picks.sigma_position[0], apexes.std(axis=0), rtol=0.03)
+    np.testing.assert_array_equal(picks.sigma_position[1], surface)
+
+
+def test_locations_of_other_circles_are_refused() -> None:
+    found = locations(DepthSource.MEASURED, DepthSource.MISSING, at=(80, 50))
+    with pytest.raises(ValueError, match=r"row 0: the circle is at \(50, 50\).* \(80, 50\)"):
+        MakePicks().process(frame_of(np.zeros((120, 160))), circles_at((50, 50), (80, 50)), found)
 
 
 def test_rows_must_agree() -> None:
@@ -88,7 +120,7 @@ def test_the_end_of_a_run_says_how_many_have_no_position(
     stage.process(frame_of(np.zeros((120, 160))), circles_at((50, 50), (80, 50)), found)
     with caplog.at_level(logging.WARNING, "mushpipe"):
         stage.close()
-    assert "1 of 2 mushrooms have no position: there is no depth at them" in caplog.messages
+    assert "1 of 2 mushrooms have no position: there is no depth at them" in caplog.text
 
 
 def test_an_empty_bed_gives_empty_picks() -> None:
