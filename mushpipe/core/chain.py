@@ -172,6 +172,14 @@ def _check_outputs(node: Node, values: tuple[Any, ...], frame: RgbdFrame) -> Non
         )
     height, width = frame.color.shape[:2]
     for value in values:
-        if isinstance(value, Mask) and value.foreground.shape != (height, width):
-            shape = value.foreground.shape
-            raise ValueError(f"its mask is {shape[1]}x{shape[0]}, the frame {width}x{height}")
+        h, w = _size(value) or (height, width)
+        if (h, w) != (height, width):
+            what = "mask" if isinstance(value, Mask) else "new frame"
+            raise ValueError(f"its {what} is {w}x{h}, the frame {width}x{height}")
+
+
+def _size(value: Any) -> tuple[int, ...] | None:
+    """Return height and width of what has pixels."""
+    if isinstance(value, Mask):
+        return value.foreground.shape
+    return value.color.shape[:2] if isinstance(value, RgbdFrame) else None

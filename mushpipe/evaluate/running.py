@@ -120,6 +120,12 @@ def plans(
     Returns:
         Per run its alternative, the number of its recording, and what to run.
     """
+    changed = [o for text in options for o in (*overrides, *text.overrides)]
+    if recordings and any(text.startswith(("source.path=", "source.use=")) for text in changed):
+        raise UsageError(
+            "source.path and source.use cannot be changed where recordings are given: they are "
+            "what is played, and whose truth counts"
+        )
     registry = load_registry()
     sources: Sequence[Path | None] = recordings or [None]
     result = []

@@ -133,6 +133,11 @@ class ReturnsTwo(Stage):
         return Mask(frame.gray > 0), circles(1)
 
 
+class Crop(Stage):
+    def process(self, frame: RgbdFrame) -> RgbdFrame:
+        return RgbdFrame(frame.header, frame.color[:, :4])
+
+
 class SmallMask(Stage):
     def process(self, frame: RgbdFrame) -> Mask:
         return Mask(np.zeros((3, 4), bool))
@@ -155,6 +160,7 @@ FAILURES = {
         ReturnsTwo,
         "TypeError: it returned (Mask, Circles), declared is (Mask)",
     ),
+    "a frame of another size": (Crop, "ValueError: its new frame is 4x6, the frame 8x6"),
     "a mask of another size": (SmallMask, "ValueError: its mask is 4x3, the frame 8x6"),
     "a value that cannot be": (
         BadCircle,

@@ -115,6 +115,13 @@ def test_a_frame_that_failed_is_missed_though_the_results_copy_no_truth_of_it(
     assert metrics(judged(results))["recall"] == 1
 
 
+def test_what_is_played_is_what_is_judged(graph: Path, tmp_path: Path) -> None:
+    for change in (["--set", "source.path=x.mcap"], ["--matrix", "source.path=x.mcap,y.mcap"]):
+        result = run(graph, "--recordings", tmp_path / "bed.mcap", *change)
+        assert isinstance(result.exception, UsageError)
+        assert "source.path and source.use cannot be changed" in str(result.exception)
+
+
 def test_labels_judge_the_frames_they_name(tmp_path: Path, truths: dict[int, Any]) -> None:
     answers = {i: picks_of(truth) for i, truth in truths.items()}
     results = write_results(tmp_path / "r.mcap", answers)
