@@ -164,6 +164,9 @@ class Locations(Columns):
         self._require(_known(self.position) == present, "position must be NaN where missing")
         self._require(_known(self.distance) == present, "distance must be NaN where missing")
         self._require(~(self.diameter <= 0), "the diameter must be positive or NaN")
+        self._require(~(self.distance < 0), "the distance must not be negative")
+        for sigma in (self.sigma_position, self.sigma_diameter[:, None]):
+            self._require(~(sigma < 0).any(axis=1), "a sigma must not be negative")
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,6 +197,7 @@ class Poses(Columns):
         for name in ("quaternion", "axis"):
             norm = np.linalg.norm(getattr(self, name), axis=1)
             self._require(~(np.abs(norm - 1) > 1e-6), f"{name} must have length 1")
+        self._require(~(self.sigma_rad < 0), "a sigma must not be negative")
 
 
 @dataclass(frozen=True, eq=False)

@@ -119,6 +119,14 @@ WRONG = [
     ),
     (locations, {"distance": [NAN, NAN]}, "Locations: distance must be NaN where missing (row 0)"),
     (locations, {"source": [3, 0]}, "Locations: the source must be a DepthSource (row 0)"),
+    (locations, {"distance": [-1, NAN]}, "Locations: the distance must not be negative (row 0)"),
+    (locations, {"sigma_diameter": [0, -1]}, "Locations: a sigma must not be negative (row 1)"),
+    (
+        locations,
+        {"sigma_position": [[1, -1, NAN], [NAN] * 3]},
+        "Locations: a sigma must not be negative (row 0)",
+    ),
+    (poses, {"sigma_rad": [-0.1, NAN]}, "Poses: a sigma must not be negative (row 0)"),
     (locations, {"diameter": [0, NAN]}, "Locations: the diameter must be positive or NaN (row 0)"),
     (
         poses,
