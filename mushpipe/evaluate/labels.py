@@ -19,7 +19,7 @@ Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 Reason = Literal[
     "hidden", "too-small", "too-large", "at-border", "not-upright", "cut-stump", "ambiguous"
 ]
-_STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
+_STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 
 class Circle(BaseModel):

@@ -35,6 +35,8 @@ _DEPTH: dict[str, tuple[str, float | None]] = {
     "mono16": ("u2", None),
     "32FC1": ("f4", 1.0),
 }
+# models in which an angle is a distance from the centre: no pinhole even with coefficients of zero
+_FISHEYE = ("equidistant", "kannala_brandt", "fisheye")
 _PNG = b"\x89PNG"
 
 
@@ -161,7 +163,7 @@ def decode_camera(message: Any, rectified: bool = False) -> Camera | None:
         return None
     model: str = "none"
     coefficients: tuple[float, ...] = ()
-    if any(d):
+    if any(d) or (message.distortion_model in _FISHEYE and not rectified):
         names = {wire: own for own, wire in DISTORTION_MODELS.items()}
         model, coefficients = names.get(message.distortion_model, "unknown"), tuple(d)
         if COEFFICIENTS.get(model) != len(d):

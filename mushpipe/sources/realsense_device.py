@@ -182,7 +182,7 @@ def camera_of(given: Any) -> Camera:
         DeviceError: The lens model is not one that `Camera` has.
     """
     model, coefficients = given.model.name, tuple(given.coeffs)
-    if not any(coefficients):
+    if not any(coefficients) and model not in ("ftheta", "kannala_brandt4"):  # fisheyes stay so
         model = "none"
     if model not in ("none", "brown_conrady", "inverse_brown_conrady"):
         raise DeviceError(f"the colour camera's lens model '{model}' is not supported")

@@ -135,6 +135,13 @@ def test_conversion_leaves_the_own_format_alone() -> None:
             "an axis needs a length",
         ),
         ({"stamp_ns": 1, "caps": [5]}, "labels with 'caps'"),
+        ({"stamp_ns": "1", "caps": []}, "frames.0.stamp_ns"),
+        ({"stamp_ns": 1, "caps": [{"u": True, "v": 1, "radius_px": 1}]}, "frames.0.caps.0.u"),
+        ({"stamp_ns": 1, "caps": [{"u": 1, "v": "1", "radius_px": 1}]}, "frames.0.caps.0.v"),
+        (
+            {"stamp_ns": 1, "caps": [{"u": 1, "v": 1, "radius_px": 1, "ignore": "yes"}]},
+            "frames.0.caps.0.ignore",
+        ),
         (
             {
                 "mushpipe_labels": 1,

@@ -95,13 +95,19 @@ def test_distortion_is_kept(tmp_path: Path, wire: str, model: str, count: int) -
     assert cameras(tmp_path, [info_at(0, d=d, model=wire), *COLORS]) == [expected] * 3
 
 
-@pytest.mark.parametrize("model", ["plumb_bob", "equidistant", ""])
+@pytest.mark.parametrize("model", ["plumb_bob", "rational_polynomial", ""])
 def test_distortion_of_zeros_is_none(model: str, tmp_path: Path) -> None:
     assert cameras(tmp_path, [info_at(0, model=model), *COLORS]) == [CALIBRATED] * 3
 
 
 @pytest.mark.parametrize(
-    ("model", "d"), [("equidistant", (0.1, 0.2, 0.3, 0.4)), ("rational_polynomial", (0.1,) * 14)]
+    ("model", "d"),
+    [
+        ("equidistant", (0.1, 0.2, 0.3, 0.4)),
+        ("equidistant", (0.0,) * 4),  # r = f theta, not f tan(theta): no pinhole
+        ("kannala_brandt", ()),
+        ("rational_polynomial", (0.1,) * 14),
+    ],
 )
 def test_an_unsupported_lens_model_is_reported_after_the_frames(
     model: str, d: tuple[float, ...], tmp_path: Path

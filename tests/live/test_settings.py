@@ -89,10 +89,11 @@ def test_lens_models(model, coefficients, expected):
     assert camera_of(given).model == expected
 
 
-def test_a_lens_that_cannot_be_handled_is_refused():
+@pytest.mark.parametrize("first", [0.1, 0.0])
+def test_a_lens_that_cannot_be_handled_is_refused(first):
     given = rs.intrinsics()
     given.width, given.height, given.fx, given.fy = 640, 480, 600.0, 600.0
-    given.model, given.coeffs = rs.distortion.kannala_brandt4, [0.1, 0, 0, 0, 0]
+    given.model, given.coeffs = rs.distortion.kannala_brandt4, [first, 0, 0, 0, 0]
     with pytest.raises(DeviceError, match="lens model 'kannala_brandt4' is not supported"):
         camera_of(given)
 
