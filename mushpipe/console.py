@@ -23,7 +23,6 @@ from mushpipe.core.overwriting import spare
 from mushpipe.core.plan import Plan
 from mushpipe.core.report import RunReport
 from mushpipe.core.run import run
-from mushpipe.core.stage import Source
 
 stderr = Console(stderr=True, highlight=False, soft_wrap=True)
 
@@ -88,8 +87,7 @@ def execute(
     plan: Plan, manifest: Path | None, capsules: Path | None, size: Callable[[], int] | None = None
 ) -> RunReport:
     """Run a plan in front of a user; no ``manifest`` or ``capsules`` where None, ``size`` above."""
-    source = plan.source.plugin
-    spare(manifest, *(source.files() if isinstance(source, Source) else ()))
+    spare(manifest, *plan.source.files())
     stop = threading.Event()
     with interruptible(stop), progress_bar(size) as show:
         report = run(plan, stop, show, capsules)

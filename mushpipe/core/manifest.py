@@ -9,15 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from mushpipe.core.plan import Plan
-from mushpipe.core.stage import RunInfo, Sink, Source
+from mushpipe.core.stage import RunInfo, Source
 
 _LIBRARIES = ("mushpipe", "numpy", "opencv-python-headless", "scikit-image", "scipy", "mcap")
 
 
 def build_manifest(plan: Plan) -> dict[str, Any]:
     """Describe a run before it starts, as plain data without any wall-clock time."""
-    source = plan.source.plugin
-    files = source.files() if isinstance(source, Source) else ()
     graph = plan.resolved()
     for node in plan.sinks:  # in which folder a result was written is none of its content
         graph["sinks"][node.name] |= node.paths
@@ -26,7 +24,7 @@ def build_manifest(plan: Plan) -> dict[str, Any]:
         "graph": graph,
         "overrides": list(plan.overrides),
         "seed": plan.seed,
-        "recordings": [_describe(path) for path in files],
+        "recordings": [_describe(path) for path in plan.source.files()],
         "versions": {"python": platform.python_version(), **_versions(plan)},
     }
 
@@ -56,7 +54,6 @@ def manifest_path(plan: Plan) -> Path:
     source = plan.source.plugin
     info = RunInfo(source.name() if isinstance(source, Source) else "", {})
     for node in plan.sinks:
-        if isinstance(node.plugin, Sink):
-            for path in node.plugin.files(info):
-                return path.with_suffix(".run.json")
+        for path in node.files(info):
+            return path.with_suffix(".run.json")
     return Path("run.json")

@@ -88,7 +88,7 @@ class _Runner:
             reader = SourceThread(self.plan.source, source, threading.Event(), durations)
             info = self._begin(source, reader)
             # Who writes a file empties it: not before all that may fail without has opened.
-            sinks = sorted(self.plan.sinks, key=lambda node: bool(_files(node, info)))
+            sinks = sorted(self.plan.sinks, key=lambda node: bool(node.files(info)))
             for node in (*self.plan.stages, *sinks):
                 stack.enter_context(_opened(node, _opener(node, info)))
             threads = [self._sink_thread(node) for node in self.plan.sinks]
@@ -109,7 +109,8 @@ class _Runner:
             device = self.report.device = source.describe()
             manifest = {**self.report.manifest, **({"device": device} if device else {})}
             info = RunInfo(source.name(), manifest, source.live, lambda: reader.box.accepted)
-        spare_files(source.files(), {node.name: _files(node, info) for node in self.plan.sinks})
+        written = {node.name: node.files(info) for node in self.plan.sinks}
+        spare_files(self.plan.source.files(), written)
         return info
 
     def _finish(self, threads: list[SinkThread]) -> None:
@@ -255,11 +256,6 @@ class _Runner:
             logger.warning("the failing frame could not be saved: %s", trouble)
         else:
             self.report.capsules.append(str(path))
-
-
-def _files(node: Node, info: RunInfo) -> tuple[Path, ...]:
-    with _named(node):
-        return node.plugin.files(info) if isinstance(node.plugin, Sink) else ()
 
 
 def _opener(node: Node, info: RunInfo | None = None) -> Callable[[], None]:

@@ -26,6 +26,9 @@ class Header:
         sequence: Number of the frame, from 0.
         frame_id: An optical frame: x right, y down, z forward.
         arrival_ns: Host time at which the frame arrived, ns since the epoch.
+
+    Raises:
+        TypeError: A time or number is no integer, or `frame_id` no text.
     """
 
     stamp_ns: int
@@ -34,6 +37,13 @@ class Header:
     arrival_ns: int = 0
 
     def __post_init__(self) -> None:
+        for name in ("stamp_ns", "sequence", "arrival_ns"):
+            value = getattr(self, name)
+            if not isinstance(value, int | np.integer):
+                raise TypeError(f"{name} of a frame's header is {value!r}, expected an integer")
+            object.__setattr__(self, name, int(value))
+        if not isinstance(self.frame_id, str):
+            raise TypeError(f"frame_id of a header is {self.frame_id!r}, expected text")
         if not self.arrival_ns:
             object.__setattr__(self, "arrival_ns", self.stamp_ns)
 

@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mushpipe import RunInfo, Sink, Trace
-from mushpipe.core.errors import InputError
+from mushpipe.console import execute
+from mushpipe.core.errors import InputError, PluginError, StageError
 from mushpipe.core.manifest import build_manifest, manifest_path
 from mushpipe.core.report import Durations, RunReport, SinkReport
 from tests.core.lab import Frames, Lab, cli
@@ -108,6 +109,16 @@ class Writes(Sink):
         return (run.path(self.path),)
 
 
+class OnePath(Writes):
+    def files(self, run: RunInfo) -> Path:  # a mistake easily made
+        return run.path(self.path)
+
+
+class NoPaths(Recorded):
+    def files(self) -> tuple[Path, ...]:
+        raise OSError("not mounted")
+
+
 @pytest.fixture
 def graph(lab: Lab) -> str:
     lab.registry.source("recorded", Recorded)
@@ -194,3 +205,19 @@ def test_the_program_writes_manifest_and_result(lab: Lab, graph: str, monkeypatc
 def test_a_source_has_a_name_and_no_files_unless_it_says_so():
     source = Frames()
     assert (source.name(), source.files(), source.counts()) == ("frames", (), {})
+
+
+def test_a_sink_that_names_no_tuple_of_files_is_told_of(lab: Lab, graph: str):
+    lab.registry.sink("one", OnePath)
+    with pytest.raises(PluginError) as caught:
+        manifest_path(lab.compile(graph.replace("collect", "one")))
+    assert str(caught.value) == (
+        "sink 'out' (one): its files() gave PosixPath('bed.out'), expected a tuple of paths"
+    )
+
+
+def test_a_source_that_cannot_name_its_files_is_told_of(lab: Lab, graph: str):
+    lab.registry.source("unmounted", NoPaths)
+    with pytest.raises(StageError) as caught:
+        execute(lab.compile(graph.replace("recorded", "unmounted")), None, None)
+    assert str(caught.value) == "source 'source' (unmounted) failed: OSError: not mounted"

@@ -15,6 +15,26 @@ def test_arrival_is_the_stamp_where_it_is_not_known():
     assert Header(5, 0, "c", 9).arrival_ns == 9
 
 
+def test_numbers_of_numpy_become_plain_ones():
+    header = Header(np.int64(5), np.uint8(1), "c")
+    assert [type(n) for n in (header.stamp_ns, header.sequence, header.arrival_ns)] == [int] * 3
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"stamp_ns": 1.5}, "stamp_ns of a frame's header is 1.5, expected an integer"),
+        ({"sequence": "1"}, "sequence of a frame's header is '1', expected an integer"),
+        ({"arrival_ns": None}, "arrival_ns of a frame's header is None, expected an integer"),
+        ({"frame_id": None}, "frame_id of a header is None, expected text"),
+    ],
+)
+def test_a_header_of_other_types_is_refused(changes: dict, message: str):
+    with pytest.raises(TypeError) as caught:
+        Header(**{"stamp_ns": 1, "sequence": 0, "frame_id": "c", **changes})
+    assert str(caught.value) == message
+
+
 def test_a_frame_is_locked():
     frame = RgbdFrame(HEADER, COLOR.copy(), np.ones((4, 6), np.uint16))
     for array in (frame.color, frame.depth, frame.gray, frame.depth_m):
