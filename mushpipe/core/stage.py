@@ -17,9 +17,13 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInf
 from pydantic.fields import FieldInfo
 
 from mushpipe.core.errors import PluginError
-from mushpipe.core.types import RgbdFrame
+from mushpipe.core.tables import Circles, Locations, Picks, Poses
+from mushpipe.core.truth import Truth
+from mushpipe.core.types import Mask, RgbdFrame
 
 Kind = Literal["stage", "source", "sink"]
+# Values are recorded under the names of their types.
+_TAKEN = {t.__name__: t for t in (Circles, Locations, Mask, Picks, Poses, RgbdFrame, Truth)}
 _METHODS: dict[Kind, str] = {"stage": "process", "source": "frames", "sink": "consume"}
 
 
@@ -264,4 +268,10 @@ def _outputs(plugin: type[Plugin], hints: dict[str, Any]) -> tuple[type, ...]:
         )
     if len(set(outputs)) < len(outputs):
         raise PluginError(f"{plugin.__qualname__}.process returns the same type twice")
+    for output in outputs:
+        if _TAKEN.get(output.__name__, output) is not output:
+            raise PluginError(
+                f"{plugin.__qualname__}.process returns a type '{output.__name__}' that is not "
+                f"mushpipe's: import mushpipe.{output.__name__}, or give your own another name"
+            )
     return outputs

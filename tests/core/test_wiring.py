@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mushpipe import Circles, Mask, Picks, RgbdFrame, Sink, Stage, Trace
+from mushpipe import Circles, Columns, Mask, Picks, RgbdFrame, Sink, Stage, Trace
 from mushpipe.core.errors import PluginError
 from mushpipe.core.plan import Link
 from mushpipe.core.stage import Port, Ports, ports_of
@@ -61,6 +61,7 @@ def none_return(self, frame: RgbdFrame) -> None: ...
 def optional_return(self, frame: RgbdFrame) -> Mask | None: ...
 def any_number(self, frame: RgbdFrame) -> tuple[Mask, ...]: ...
 def twice(self, frame: RgbdFrame) -> tuple[Mask, Mask]: ...
+def namesake(self, frame: RgbdFrame) -> type("Circles", (Columns,), {}): ...
 def unknown(self, frame: "Frame") -> Mask: ...  # noqa: F821
 def unknown_part(self, frame: "np.no_such_thing") -> Mask: ...
 
@@ -81,6 +82,7 @@ RETURNS = "Declared.process must be annotated with what it returns: a type, or a
         (optional_return, RETURNS),
         (any_number, RETURNS),
         (twice, "Declared.process returns the same type twice"),
+        (namesake, "Declared.process returns a type 'Circles' that is not mushpipe's"),
         (unknown, "Declared.process: unknown annotation: name 'Frame' is not defined"),
         (unknown_part, "Declared.process: unknown annotation: module 'numpy' has no attribute"),
     ],
