@@ -225,11 +225,14 @@ def _translate(
     problems = []
     of = f" of '{use}'" if use else ""
     for item in error.errors():
-        path, place = (*at, *item["loc"]), ".".join(map(str, item["loc"]))
-        name = str(item["loc"][-1]) if item["loc"] else ""
-        if item["type"] == "extra_forbidden":
+        unknown, loc = item["type"] == "extra_forbidden", item["loc"]
+        if not unknown:  # where a setting may be of several types, pydantic's names for them
+            loc = tuple(part for part in loc if "[" not in str(part))
+        path, place = (*at, *loc), ".".join(map(str, loc))
+        name = str(loc[-1]) if loc else ""
+        if unknown:
             what = f"unknown setting '{name}'{of}"
-            top = len(item["loc"]) == 1
+            top = len(loc) == 1
             problems.append(document.problem(path, what, suggest(name, known) if top else "", True))
         elif item["type"] == "missing":
             text = f"setting '{place}'{of} is missing"

@@ -272,6 +272,26 @@ def test_a_value_that_a_list_lacks_is_counted(lab: Lab):
     assert "span of 'ranged': value 2 is missing" in lab.faults(graph)
 
 
+@pytest.mark.parametrize(
+    ("given", "faults"),
+    [
+        (
+            "foo",
+            ["Input should be 'bed' or 'camera', got \"foo\"", "valid array"],
+        ),
+        ("[1, 2]", ["Input should be 'bed' or 'camera', got [1, 2]", "value 3 is missing"]),
+        ("[0, 0, 0]", ["the upright has no direction: a vector needs a component that is not 0"]),
+    ],
+)
+def test_a_setting_of_several_types_is_called_by_its_own_name(given: str, faults: list[str]):
+    graph = "mushpipe: 1\nsource: {use: synthetic}\nstages:\n  pose: {use: cap-fit, up: %s}\n"
+    with pytest.raises(GraphError) as caught:
+        compile_document(parse_document(graph % given, "graph.yaml", Path()), load_registry())
+    lines = [line for line in str(caught.value).splitlines() if "up of 'cap-fit': " in line]
+    assert all(any(fault in line for line in lines) for fault in faults)
+    assert "function-after" not in str(caught.value)
+
+
 def test_faults_that_a_plugin_finds_in_its_settings_are_told_before_a_run(lab: Lab):
     lab.registry.sink("mcap", McapSink)
     lab.registry.sink("rerun", RerunSink)
