@@ -18,6 +18,7 @@ from rich.logging import RichHandler
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from mushpipe.core.edges import files_of
 from mushpipe.core.errors import EXIT_INTERRUPTED
 from mushpipe.core.overwriting import spare
 from mushpipe.core.plan import Plan
@@ -87,7 +88,7 @@ def execute(
     plan: Plan, manifest: Path | None, capsules: Path | None, size: Callable[[], int] | None = None
 ) -> RunReport:
     """Run a plan in front of a user; no ``manifest`` or ``capsules`` where None, ``size`` above."""
-    spare(manifest, *plan.source.files())
+    spare(manifest, *files_of(plan.source))
     stop = threading.Event()
     with interruptible(stop), progress_bar(size) as show:
         report = run(plan, stop, show, capsules)

@@ -9,13 +9,14 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
-from mushpipe.core.errors import MushpipeError, StageError
+from mushpipe.core.errors import MushpipeError, PluginError, StageError
 from mushpipe.core.mailbox import Mailbox
 from mushpipe.core.plan import Node
 from mushpipe.core.report import Durations, SinkReport
-from mushpipe.core.stage import ReplaySource, Source
+from mushpipe.core.stage import ReplaySource, RunInfo, Sink, Source
 from mushpipe.core.types import RgbdFrame
 
 logger = logging.getLogger("mushpipe")
@@ -32,6 +33,39 @@ def failure(node: Node, sequence: int | None, error: BaseException) -> StageErro
     if not known:
         logger.debug("where %s '%s' failed:", node.kind, node.name, exc_info=error)
     return StageError(f"{node.kind} '{node.name}' ({node.use}) failed{at}: {text}", code)
+
+
+@contextmanager
+def named(node: Node) -> Iterator[None]:
+    """Say which plugin an error outside of a frame comes from."""
+    try:
+        yield
+    except MushpipeError:
+        raise
+    except Exception as error:
+        raise failure(node, None, error) from error
+
+
+def files_of(node: Node, run: RunInfo | None = None) -> tuple[Path, ...]:
+    """Return the files that a source reads, or that a sink writes in a run.
+
+    Raises:
+        StageError: The plugin's ``files`` failed.
+        PluginError: It gave no paths.
+    """
+    plugin = node.plugin
+    found: object = ()
+    with named(node):
+        if isinstance(plugin, Source):
+            found = plugin.files()
+        elif isinstance(plugin, Sink) and run is not None:
+            found = plugin.files(run)
+    if not isinstance(found, tuple | list) or not all(isinstance(path, Path) for path in found):
+        raise PluginError(
+            f"{node.kind} '{node.name}' ({node.use}): its files() gave {found!r}, expected a "
+            "tuple of paths"
+        )
+    return tuple(found)
 
 
 def limited(frames: Iterator[RgbdFrame], source: Source) -> Iterator[RgbdFrame]:

@@ -8,6 +8,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from mushpipe.core.edges import files_of
 from mushpipe.core.plan import Plan
 from mushpipe.core.stage import RunInfo, Source
 
@@ -24,7 +25,7 @@ def build_manifest(plan: Plan) -> dict[str, Any]:
         "graph": graph,
         "overrides": list(plan.overrides),
         "seed": plan.seed,
-        "recordings": [_describe(path) for path in plan.source.files()],
+        "recordings": [_describe(path) for path in files_of(plan.source)],
         "versions": {"python": platform.python_version(), **_versions(plan)},
     }
 
@@ -54,6 +55,6 @@ def manifest_path(plan: Plan) -> Path:
     source = plan.source.plugin
     info = RunInfo(source.name() if isinstance(source, Source) else "", {})
     for node in plan.sinks:
-        for path in node.files(info):
+        for path in files_of(node, info):
             return path.with_suffix(".run.json")
     return Path("run.json")

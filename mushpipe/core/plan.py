@@ -7,8 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from mushpipe.core.errors import MushpipeError, PluginError, StageError
-from mushpipe.core.stage import STDIO, Kind, Plugin, Ports, RunInfo, Sink, Source
+from mushpipe.core.stage import STDIO, Kind, Plugin, Ports, Sink, Source
 
 
 class Link(NamedTuple):
@@ -44,27 +43,6 @@ class Node:
         if self.delivery:
             entry["delivery"] = self.delivery
         return entry
-
-    def files(self, run: RunInfo | None = None) -> tuple[Path, ...]:
-        """Return the files that a source reads, or that a sink writes in a run.
-
-        Raises:
-            StageError: The plugin's ``files`` failed.
-            PluginError: It gave no paths.
-        """
-        whose = f"{self.kind} '{self.name}' ({self.use})"
-        try:
-            if isinstance(self.plugin, Source):
-                found: object = self.plugin.files()
-            else:
-                found = self.plugin.files(run) if run and isinstance(self.plugin, Sink) else ()
-        except MushpipeError:
-            raise
-        except Exception as error:
-            raise StageError(f"{whose} failed: {type(error).__name__}: {error}") from error
-        if not isinstance(found, tuple | list) or not all(isinstance(p, Path) for p in found):
-            raise PluginError(f"{whose}: its files() gave {found!r}, expected a tuple of paths")
-        return tuple(found)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,14 @@ from pathlib import Path
 
 from mushpipe.core.capsule import write_capsule
 from mushpipe.core.chain import Chain, Passage, Turnstile, cores_shared, sink_inputs
-from mushpipe.core.edges import SinkThread, SourceThread, failure, interruptible_opening
+from mushpipe.core.edges import (
+    SinkThread,
+    SourceThread,
+    failure,
+    files_of,
+    interruptible_opening,
+    named,
+)
 from mushpipe.core.errors import InputError, MushpipeError, StageError
 from mushpipe.core.manifest import build_manifest
 from mushpipe.core.overwriting import spare_files
@@ -79,7 +86,7 @@ class _Runner:
         source = self.plan.source.plugin
         if not isinstance(source, Source):
             raise TypeError("the plan's source is not a Source")
-        with _named(self.plan.source):
+        with named(self.plan.source):
             self.report.manifest = build_manifest(self.plan)
         with ExitStack() as stack:
             with interruptible_opening(source, self.stop):
@@ -87,8 +94,10 @@ class _Runner:
             durations = self.report.durations[self.plan.source.name]
             reader = SourceThread(self.plan.source, source, threading.Event(), durations)
             info = self._begin(source, reader)
+            written = {node.name: files_of(node, info) for node in self.plan.sinks}
+            spare_files(files_of(self.plan.source), written)
             # Who writes a file empties it: not before all that may fail without has opened.
-            sinks = sorted(self.plan.sinks, key=lambda node: bool(node.files(info)))
+            sinks = sorted(self.plan.sinks, key=lambda node: bool(written[node.name]))
             for node in (*self.plan.stages, *sinks):
                 stack.enter_context(_opened(node, _opener(node, info)))
             threads = [self._sink_thread(node) for node in self.plan.sinks]
@@ -105,13 +114,10 @@ class _Runner:
         """Return what the sinks are told, now that the source is open."""
         on_error = self.plan.on_error or ("fail" if self.plan.replay() else "skip")
         self.tolerance = self.plan.max_failures if on_error == "skip" else 1
-        with _named(self.plan.source):
+        with named(self.plan.source):
             device = self.report.device = source.describe()
             manifest = {**self.report.manifest, **({"device": device} if device else {})}
-            info = RunInfo(source.name(), manifest, source.live, lambda: reader.box.accepted)
-        written = {node.name: node.files(info) for node in self.plan.sinks}
-        spare_files(self.plan.source.files(), written)
-        return info
+            return RunInfo(source.name(), manifest, source.live, lambda: reader.box.accepted)
 
     def _finish(self, threads: list[SinkThread]) -> None:
         """Tell the sinks how the run went; the first error of the run stays the one reported."""
@@ -266,25 +272,14 @@ def _opener(node: Node, info: RunInfo | None = None) -> Callable[[], None]:
 
 
 @contextmanager
-def _named(node: Node) -> Iterator[None]:
-    """Say which plugin an error outside of a frame comes from."""
-    try:
-        yield
-    except MushpipeError:
-        raise
-    except Exception as error:
-        raise failure(node, None, error) from error
-
-
-@contextmanager
 def _opened(node: Node, opener: Callable[[], None]) -> Iterator[Plugin]:
     try:
-        with _named(node):
+        with named(node):
             opener()
         yield node.plugin
     except BaseException:
         with suppress(Exception):  # the first error is the one to report
             node.plugin.close()
         raise
-    with _named(node):
+    with named(node):
         node.plugin.close()

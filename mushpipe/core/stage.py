@@ -17,13 +17,12 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInf
 from pydantic.fields import FieldInfo
 
 from mushpipe.core.errors import PluginError
-from mushpipe.core.tables import Circles, Locations, Picks, Poses
-from mushpipe.core.truth import Truth
+from mushpipe.core.truth import BUILT_IN
 from mushpipe.core.types import Mask, RgbdFrame
 
 Kind = Literal["stage", "source", "sink"]
 # Values are recorded under the names of their types.
-_TAKEN = {t.__name__: t for t in (Circles, Locations, Mask, Picks, Poses, RgbdFrame, Truth)}
+_TAKEN: dict[str, type] = {t.__name__: t for t in (*BUILT_IN, Mask, RgbdFrame)}
 _METHODS: dict[Kind, str] = {"stage": "process", "source": "frames", "sink": "consume"}
 
 

@@ -11,7 +11,16 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.tables import Columns, Floats, column, locked
+from mushpipe.core.tables import (
+    Circles,
+    Columns,
+    Floats,
+    Locations,
+    Picks,
+    Poses,
+    column,
+    locked,
+)
 
 TRUTH_TOPIC = "/truth/mushrooms"
 INSTANCES_TOPIC = "/truth/instances"
@@ -66,6 +75,10 @@ class Truth(Columns):
         self._require(~((self.visible < 0) | (self.visible > 1)), "visible must be within 0..1")
         norm = np.linalg.norm(self.axis, axis=1)
         self._require(~(np.abs(norm - 1) > 1e-6), "axis must have length 1")
+
+
+BUILT_IN = (Circles, Locations, Poses, Picks, Truth)
+"""The tables that recordings know by name."""
 
 
 @dataclass(frozen=True, eq=False)

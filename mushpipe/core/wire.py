@@ -15,10 +15,9 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from mushpipe.core import tables
 from mushpipe.core.geometry import Camera
 from mushpipe.core.tables import Columns
-from mushpipe.core.truth import Instances, Truth
+from mushpipe.core.truth import BUILT_IN, Instances
 from mushpipe.core.types import Header, Mask, RgbdFrame
 
 COLOR_TOPIC = "/camera/color/image_raw"
@@ -35,10 +34,7 @@ DISTORTION_MODELS = {
     "inverse_brown_conrady": "inverse_brown_conrady",
     "rational": "rational_polynomial",
 }
-TABLES = {
-    f"mushpipe.{cls.__name__}": cls
-    for cls in (tables.Circles, tables.Locations, tables.Poses, tables.Picks, Truth)
-}
+TABLES = {f"mushpipe.{cls.__name__}": cls for cls in BUILT_IN}
 
 
 @dataclass(frozen=True)

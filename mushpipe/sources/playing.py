@@ -131,10 +131,7 @@ class Player:
 
     def _take(self, raw: Raw, pairing: Pairing[_Color, _Depth]) -> Iterator[RgbdFrame]:
         if raw.channel.topic == self.topics.camera:
-            unread = self.counts.total()
-            camera = self.calibration(raw, "calibrations")
-            if self.counts.total() == unread:  # None says here that there is none any more
-                self.camera = camera
+            self.calibration(raw, "calibrations")
         elif raw.channel.topic == self.topics.depth:
             depth = self._decode(raw, self._depth)
             if depth:
@@ -162,13 +159,17 @@ class Player:
         return replace(frame, attached=attached) if attached else frame
 
     def calibration(self, raw: Raw, what: str = "") -> Camera | None:
-        """Decode a calibration; one that cannot be is counted, where ``what`` says as what."""
+        """Decode a calibration, which holds from now on, also where it says that there is none.
+
+        One that cannot be decoded changes nothing, and is counted where ``what`` says as what.
+        """
         name = self.topics.color.split("/")
         rectified = any(part.startswith("image_rect") for part in name)  # as ROS calls them
 
         def decode(message: Any, raw: Raw) -> Camera | None:
             self._calibrated = _stamp(message, raw)[1]
-            return decode_camera(message, rectified)
+            self.camera = decode_camera(message, rectified)
+            return self.camera
 
         return self._decode(raw, decode, what)
 

@@ -216,8 +216,10 @@ def test_a_sink_that_names_no_tuple_of_files_is_told_of(lab: Lab, graph: str):
     )
 
 
-def test_a_source_that_cannot_name_its_files_is_told_of(lab: Lab, graph: str):
+def test_a_source_that_cannot_name_its_files_is_told_of(lab: Lab, graph: str, caplog):
+    caplog.set_level("DEBUG", "mushpipe")
     lab.registry.source("unmounted", NoPaths)
     with pytest.raises(StageError) as caught:
         execute(lab.compile(graph.replace("recorded", "unmounted")), None, None)
     assert str(caught.value) == "source 'source' (unmounted) failed: OSError: not mounted"
+    assert "where source 'source' failed" in caplog.text

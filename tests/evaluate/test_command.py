@@ -79,17 +79,24 @@ def test_a_misspelt_metric_is_found(perfect: Path, name: str) -> None:
     assert "did you mean" in str(result.exception)
 
 
+def manifest_of(recording: Path, path: str) -> str:
+    """Return the manifest of a run that read `recording` by `path`."""
+    sha256 = hashlib.sha256(recording.read_bytes()).hexdigest()
+    return json.dumps(
+        {
+            "graph": {"source": {"use": "mcap", "path": path}},
+            "recordings": [{"file": recording.name, "sha256": sha256}],
+        }
+    )
+
+
 def test_truth_is_found_in_the_recording_the_results_name(
     tmp_path: Path, truths: dict[int, Any]
 ) -> None:
     recording = write_recording(tmp_path / "bed.mcap", truths)
-    sha256 = hashlib.sha256(recording.read_bytes()).hexdigest()
-    manifest = {
-        "graph": {"source": {"use": "mcap", "path": "elsewhere/bed.mcap"}},
-        "recordings": [{"file": "bed.mcap", "sha256": sha256}],
-    }
+    manifest = manifest_of(recording, "elsewhere/bed.mcap")
     answers = {i: picks_of(truth) for i, truth in truths.items()}
-    results = write_results(tmp_path / "r.mcap", answers, manifest=json.dumps(manifest))
+    results = write_results(tmp_path / "r.mcap", answers, manifest=manifest)
     assert metrics(judged(results))["f"] == 1
     write_recording(recording, {0: bed(7)})  # no longer the one it was
     result = run(results)
@@ -102,14 +109,10 @@ def test_a_frame_that_failed_is_missed_though_the_results_copy_no_truth_of_it(
     tmp_path: Path, truths: dict[int, Any]
 ) -> None:
     recording = write_recording(tmp_path / "bed.mcap", truths)
-    sha256 = hashlib.sha256(recording.read_bytes()).hexdigest()
-    manifest = {
-        "graph": {"source": {"use": "mcap", "path": "bed.mcap"}},
-        "recordings": [{"file": "bed.mcap", "sha256": sha256}],
-    }
+    manifest = manifest_of(recording, "bed.mcap")
     kept = {i: truths[i] for i in (0, 2)}
     answers = {i: picks_of(truth) for i, truth in kept.items()}
-    results = write_results(tmp_path / "r.mcap", answers, kept, manifest=json.dumps(manifest))
+    results = write_results(tmp_path / "r.mcap", answers, kept, manifest=manifest)
     assert metrics(judged(results))["recall"] == pytest.approx(2 / 3)
     recording.unlink()  # what the results hold is better than nothing
     assert metrics(judged(results))["recall"] == 1
