@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.jit import jit
-from mushpipe.stages.cap_attempt import COUNTS, ODD, POOR, fit_circle, mend, scratch
+from mushpipe.core.jit import borrower, jit
+from mushpipe.stages.cap_attempt import COUNTS, ODD, POOR, Fit, fit_circle, mend, scratch
 from mushpipe.stages.cap_blocks import CELLS
 from mushpipe.stages.cap_circle import improve
 from mushpipe.stages.cap_model import (
@@ -21,20 +21,21 @@ from mushpipe.stages.cap_model import (
     Floats,
     N,
     Single,
-    Singles,
     Vector,
+    beside,
     frozen,
     meet,
     slope,
 )
 from mushpipe.stages.cap_order import Order
 from mushpipe.stages.cap_samples import ASTRAY, DIRECTIONS, ray_at
-from mushpipe.stages.cap_solve import ROUND, Noise, invert, refine, tilt, workspace
+from mushpipe.stages.cap_solve import ROUND, Noise, invert, refine, tilt
 from mushpipe.stages.cap_start import spread_of
 
 ROUNDNESS = 0.01  # in rim radii: how far the rim of a cap is from the circle of its area
 GUESSED = 0.1  # in rim radii: how far off an outline is that no depth edge confirms,
 SEEN = 5  # and with what power of the share that is not confirmed that grows
+TOLD = 11  # numbers that follow from a fit, see `describe`
 LEVER = 1.5  # rad of tilt per outline error in rim radii
 
 
@@ -79,69 +80,94 @@ class Fits:
     misfit: Floats
 
 
-@jit
-def first_fits(
-    frame: Any, circles: Floats, rank: NDArray[np.int64], upright: tuple[Floats, float],
-    settings: Any, rays: Singles, out: Any,
+@borrower
+def first_fit(
+    frame: Any, circle: Floats, ranks: tuple[int, int], upright: tuple[Vector, float],
+    settings: Any, fit: Fit, room: Any,
 ) -> None:  # fmt: skip
-    """Gather the rays of every cap, and fit it with the same prior for all.
+    """Gather the rays of a cap and fit it with the prior that is set, if need be in another circle.
 
     Args:
         frame: Luma (H, W); depth (H, W) m, missing where not above 0, with rays (H, W, 2) and
             ranks (H, W); focal length, px.
-        circles: (N, 3) x, y, radius, px.
-        rank: (N,) of them, as `ranks` from `by_depth`.
-        upright: Unit vector (3,) and spread of tilts, rad.
+        circle: (3,) x, y, radius, px.
+        ranks: Of the circle, and of no circle.
+        upright: Unit vector and spread of tilts, rad.
         settings: `Noise`; sigma of depth (2), bias (m) and edge offset (px); sigma of the outline
             in colour, px; fewest points.
-        rays: (N, 6, ROOM) room for those of each cap.
-        out: Per cap parameters, covariance, surface point with sigmas, and counts; parameters and
-            counts are filled as by `fit_circle`. A cap without a fit keeps a count of 0.
+        fit: Out, as by `fit_circle`; without a fit it keeps its count of 0.
+        room: From `scratch`.
     """
-    caps, _, _, counts = out
-    room = scratch()
-    for i in range(len(circles)):
-        fit, ranks = (rays[i], caps[i], counts[i]), (rank[i], len(circles))
-        misfit = fit_circle(frame, circles[i], rank[i], upright, settings, fit, room)
-        if ODD < misfit < np.inf:
-            mend(frame, circles[i], ranks, misfit, upright, settings, fit, room)
+    misfit = fit_circle(frame, circle, ranks[0], upright, settings, fit, room)
+    if ODD < misfit < np.inf:
+        mend(frame, circle, ranks, misfit, upright, settings, fit, room)
+
+
+@borrower
+def second_fit(
+    frame: Any, circle: Floats, upright: tuple[Vector, float], settings: Any, fit: Fit,
+    covariance: Floats, told: Floats, room: Any,
+) -> None:  # fmt: skip
+    """Refine a fit with what the scene says of its cap's tilt, and then its circle, in place.
+
+    Arguments as `first_fit`, and out: covariance (8, 8), and what follows from the fit, (11,), as
+    `locate` and `describe` fill it. If any of it is not finite, the count of points becomes 0.
+    """
+    _, image, focal = frame
+    (rays, cap, counts), noise = fit, settings[0]
+    count = ROUND + int(counts[0] + counts[1] + counts[2])
+    setting = (noise, 1.0 / focal, counts[4])
+    counts[3], counts[5] = refine(cap, rays, count, upright, setting, (4, 5), room.work)
+    invert(room.work[0][0], covariance)
+    held, doubt = (counts[1], counts[2]), max(1.0, counts[5] / POOR)
+    improve(circle, cap, held, doubt, image[1], focal, room.lanes)
+    ray = ray_at(image[1], focal, circle[0], circle[1])
+    locate(cap, ray, covariance, noise.circle_px / focal, told)
+    describe(fit, covariance, told)
+    total = counts[3] + counts[5]
+    for value in cap:
+        total += value
+    for value in told:
+        total += value
+    if not (np.isfinite(total) and counts[3] >= 0.0):
+        counts[0] = 0.0
 
 
 @jit
-def second_fits(
-    frame: Any, circles: Floats, upright: tuple[Floats, float], settings: Any, rays: Singles,
-    out: Any,
+def fit_all(
+    frame: Any, circles: Floats, rank: NDArray[np.int64], upright: tuple[Vector, float],
+    settings: Any, out: Any,
 ) -> None:  # fmt: skip
-    """Refine every fit with what the scene says of its caps' tilt, and then its circle, in place.
+    """Fit every cap, first with the same prior for all, then with what they say of the scene.
 
-    Arguments as `first_fits`.
+    Args:
+        frame: As in `first_fit`.
+        circles: (N, 3) x, y, radius, px, in and out: improved.
+        rank: (N,) of them, as `ranks` from `by_depth`.
+        upright: As in `first_fit`.
+        settings: As in `first_fit`.
+        out: Per cap parameters, covariance, what follows, and counts, as by `second_fit`. A cap
+            without a fit has a count of 0, and the rest says nothing.
     """
-    _, image, focal = frame
-    noise = settings[0]
-    caps, covariances, surfaces, counts = out
-    squares, variances = np.full(len(caps), -1.0), np.ones(len(caps))
-    for i in range(len(caps)):
+    caps, covariances, told, counts = out
+    room, n = scratch(*frame[1][0].shape), len(circles)
+    rays = np.empty((n, 6, ROOM), np.float32)
+    squares, variances, spreads = np.full(n, -1.0), np.ones(n), np.empty(n)
+    for i in range(n):
+        fit = Fit(rays[i], caps[i], counts[i])
+        first_fit(frame, circles[i], (rank[i], n), upright, settings, fit, room)
         if counts[i, 0] > 0:
             first, second = tilt(caps[i], upright[0])
             squares[i] = first * first + second * second
             variances[i] = counts[i, 7]
-    spreads, work = np.empty(len(caps)), workspace()
     spread_of(squares, variances, upright[1], spreads)
-    for i in range(len(caps)):
-        if counts[i, 0] == 0:
-            continue
-        count = ROUND + int(counts[i, 0] + counts[i, 1] + counts[i, 2])
-        setting = (noise, 1.0 / focal, counts[i, 4])
-        own = (upright[0], spreads[i])
-        counts[i, 3], counts[i, 5] = refine(caps[i], rays[i], count, own, setting, (4, 5), work)
-        invert(work[0][0], covariances[i])
-        held, doubt = (counts[i, 1], counts[i, 2]), max(1.0, counts[i, 5] / POOR)
-        improve(circles[i], caps[i], held, doubt, image[1], focal)
-        ray = ray_at(image[1], focal, circles[i, 0], circles[i, 1])
-        locate(caps[i], ray, covariances[i], noise.circle_px / focal, surfaces[i])
+    for i in range(n):
+        if counts[i, 0] > 0:
+            fit, own = Fit(rays[i], caps[i], counts[i]), (upright[0], spreads[i])
+            second_fit(frame, circles[i], own, settings, fit, covariances[i], told[i], room)
 
 
-@jit
+@borrower
 def locate(cap: Floats, ray: Vector, covariance: Floats, sigma: float, out: Floats) -> None:
     """Fill the point (3,) where a ray meets a cap, and its sigmas (3,), m.
 
@@ -150,14 +176,14 @@ def locate(cap: Floats, ray: Vector, covariance: Floats, sigma: float, out: Floa
         ray: Unit vector.
         covariance: (8, 8) of the cap.
         sigma: Of the ray's direction, rad.
-        out: (6,) out.
+        out: (6 or more,) out.
     """
     c, away = frozen(cap), np.sqrt(cap[0] ** 2 + cap[1] ** 2 + cap[2] ** 2)
     r = (Single(ray[0]), Single(ray[1]), Single(ray[2]))
-    q = [Single((away * ray[i] - cap[i]) / cap[RADIUS]) for i in range(3)]
-    t, k, _ = meet(c, (q[0], q[1], q[2]), r, False)
-    q = [q[i] + t * r[i] for i in range(3)]
-    row = np.array(slope(c, (q[0], q[1], q[2]), r, k))
+    x, y, z = Single(cap[0]), Single(cap[1]), Single(cap[2])
+    q = beside((x, y, z), Single(away), Single(1) / c[11], r)
+    t, per_k, _ = meet(c, q, r, False)
+    row = slope(c, (q[0] + t * r[0], q[1] + t * r[1], q[2] + t * r[2]), r, per_k)
     t = away + t * cap[RADIUS]
     variance = 0.0
     for i in range(UNKNOWNS):
@@ -172,6 +198,30 @@ def locate(cap: Floats, ray: Vector, covariance: Floats, sigma: float, out: Floa
         share = ray[i] * ray[i]
         out[i] = far * ray[i]
         out[3 + i] = np.sqrt(along * share + across * (1.0 - share))
+
+
+@borrower
+def describe(fit: Fit, covariance: Floats, told: Floats) -> None:
+    """Widen the sigmas by what a fit cannot know of itself, and fill those of tilt and radius.
+
+    Args:
+        fit: Of the cap.
+        covariance: (8, 8) of it.
+        told: (11,) surface point and its sigmas (m), in and out; sigmas of tilt (rad) and radius
+            (m) and the apex (m), out.
+    """
+    _, cap, counts = fit
+    doubt = max(1.0, counts[5] / POOR)
+    guessed = GUESSED * (1.0 - counts[1] / DIRECTIONS) ** SEEN
+    if counts[6] > ASTRAY * (counts[0] + counts[6]):
+        for i in range(3, 6):
+            told[i] = np.hypot(told[i], cap[RADIUS])
+    tilts = covariance[3, 3] + covariance[4, 4] + (LEVER * guessed) ** 2
+    told[6] = doubt * np.sqrt(tilts)
+    outline = (ROUNDNESS**2 + guessed**2) * cap[RADIUS] ** 2
+    told[7] = doubt * np.sqrt(covariance[5, 5] + outline)
+    for i in range(3):
+        told[8 + i] = cap[i] + cap[HEIGHT] * cap[N + i]
 
 
 def fit_caps(
@@ -198,14 +248,12 @@ def fit_caps(
     out = (
         np.full((n, SIZE), np.nan),
         np.full((n, UNKNOWNS, UNKNOWNS), np.nan),
-        np.full((n, 6), np.nan),
+        np.full((n, TOLD), np.nan),
         np.zeros((n, COUNTS)),
     )
-    rays = np.empty((n, 6, ROOM), np.float32)
     rank, ranks = order
-    ranked = (gray, (*image, ranks), focal)
-    first_fits(ranked, circles, rank, upright, settings, rays, out)
-    second_fits(ranked, improved, upright, settings, rays, out)
+    up = (float(upright[0][0]), float(upright[0][1]), float(upright[0][2]))
+    fit_all((gray, (*image, ranks), focal), improved, rank, (up, upright[1]), settings, out)
     return _fits(circles, improved, *out)
 
 
@@ -214,31 +262,25 @@ def _fits(
     improved: Floats,
     caps: Floats,
     covariances: Floats,
-    surfaces: Floats,
+    told: Floats,
     counts: Floats,
 ) -> Fits:
-    finite = np.isfinite(caps).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
-    valid = (counts[:, 0] > 0) & (counts[:, 3] >= 0) & finite & np.isfinite(surfaces).all(axis=1)
-    for array in (caps, covariances, surfaces):
+    valid = counts[:, 0] > 0
+    for array in (caps, covariances, told):
         array[~valid] = np.nan
-    diagonal = np.diagonal(covariances, axis1=1, axis2=2)
-    guessed = GUESSED * (1 - counts[:, 1] / DIRECTIONS) ** SEEN
-    astray = counts[:, 6] > ASTRAY * (counts[:, 0] + counts[:, 6])
-    doubt = np.maximum(counts[:, 5] / POOR, 1)
-    center, axis = caps[:, :3], caps[:, N : N + 3]
     return Fits(
         valid,
         np.where(valid[:, None], improved, circles),
-        center,
-        axis,
+        caps[:, :3],
+        caps[:, N : N + 3],
         caps[:, RADIUS],
         caps[:, HEIGHT],
-        center + caps[:, HEIGHT, None] * axis,
-        surfaces[:, :3],
+        told[:, 8:],
+        told[:, :3],
         covariances,
-        doubt * np.sqrt(diagonal[:, 3] + diagonal[:, 4] + (LEVER * guessed) ** 2),
-        doubt * np.sqrt(diagonal[:, 5] + (ROUNDNESS**2 + guessed**2) * caps[:, RADIUS] ** 2),
-        np.hypot(surfaces[:, 3:], np.where(astray, caps[:, RADIUS], 0)[:, None]),
+        told[:, 6],
+        told[:, 7],
+        told[:, 3:6],
         np.where(valid, np.minimum(counts[:, 3] / len(CELLS), 1.0), np.nan),
         counts[:, 1].astype(np.int64),
         counts[:, 2].astype(np.int64),

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.jit import inlined, jit
+from mushpipe.core.jit import borrower, inlined, jit
 from mushpipe.stages.cap_model import Floats, Single, Singles
 
 GRID = 11
@@ -16,13 +18,63 @@ _CENTERS: Floats = (np.arange(GRID) + 0.5) / GRID * 2 - 1
 _X, _Y = np.meshgrid(_CENTERS, _CENTERS)
 _INSIDE = _X**2 + _Y**2 <= 1
 CELLS: Floats = np.stack([_X[_INSIDE], _Y[_INSIDE]], axis=-1)
-_SKIPPED = np.argmax(_INSIDE, axis=1)  # cells of a row outside of the circle, on either side
+K = 104  # and some in the middle: the compiler works on several at once
+CELL_X, CELL_Y = np.pad(CELLS, ((0, K - len(CELLS)), (0, 0))).T.copy()
+# rows of K in the table of blocks: valid pixels, mean u and v (px), mean depth (m), its variance
+COUNT, U, V, DEPTH, SPREAD = range(5)
+
+
+class Window(NamedTuple):
+    """A part of an image, px: its first column and row, and its size."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+
+class Cut(NamedTuple):
+    """Room for what is taken from an image around one circle after the other.
+
+    Attributes:
+        own: (H W,) the depth of a window, row by row.
+        pixels: (3 K,) rows of K, where in the window a block's middle is, and a pixel of it.
+        blocks: (6 K,) rows of K, the blocks, and the depth of a pixel of each.
+        values: (K,) to sort.
+    """
+
+    own: Singles
+    pixels: NDArray[np.int32]
+    blocks: Singles
+    values: Singles
 
 
 @jit
+def room_to_cut(height: int, width: int) -> Any:
+    """Return a `Cut` for images (H, W)."""
+    return Cut(
+        np.empty(height * width, np.float32),
+        np.empty(3 * K, np.int32),
+        np.empty(6 * K, np.float32),
+        np.empty(K, np.float32),
+    )
+
+
+@inlined
+def half_width(radius: float, shape: tuple[int, int]) -> int:
+    """Return the half width of the blocks in a circle (px), in an image (H, W)."""
+    return int(min(np.floor(radius / GRID), float(shape[0] + shape[1])))
+
+
+@borrower
 def own_depth(
-    depth: Singles, ranks: NDArray[np.int16], rank: int, circle: Floats, reach: float
-) -> tuple[Singles, int, int]:
+    depth: Singles,
+    ranks: NDArray[np.int16],
+    rank: int,
+    circle: Floats,
+    reach: float,
+    own: Singles,
+) -> Window:
     """Cut the depth around a circle out of an image.
 
     Args:
@@ -31,72 +83,70 @@ def own_depth(
         rank: This circle's; pixels of a lower one are hidden.
         circle: (3,) x, y, radius, px.
         reach: How far around the centre, in radii.
+        own: (H W,) out, row by row: the depth, 0 where it is missing, HIDDEN where a nearer circle
+            hides it.
 
     Returns:
-        A copy of the depth, as far as the image goes, 0 where it is missing, HIDDEN where a nearer
-        circle hides it; and u and v of its first pixel.
+        What of the image that is.
     """
     far = reach * circle[2] + 2.0
     left = min(max(int(circle[0] - far), 0), depth.shape[1])
     right = min(max(int(circle[0] + far) + 2, left), depth.shape[1])
     top = min(max(int(circle[1] - far), 0), depth.shape[0])
     bottom = min(max(int(circle[1] + far) + 2, top), depth.shape[0])
-    own = np.empty((bottom - top, right - left), np.float32)
+    width, lowest = right - left, np.int16(rank)
     for i in range(bottom - top):
-        row, seen, nearest = own[i], depth[top + i, left:right], ranks[top + i, left:right]
-        for j in range(len(row)):
+        seen, nearest = depth[top + i, left:right], ranks[top + i, left:right]
+        for j in range(width):
             z = seen[j] if seen[j] > Single(0) else Single(0)  # false for NaN
-            row[j] = z if nearest[j] >= rank else HIDDEN
-    return own, left, top
+            own[i * width + j] = z if nearest[j] >= lowest else HIDDEN
+    return Window(left, top, width, bottom - top)
 
 
-@jit
-def average(
-    cut: tuple[Singles, int, int], circle: Floats, half: int, means: Floats, counts: Floats
-) -> None:
+@borrower
+def average(window: Window, circle: Floats, half: int, cut: Cut) -> None:
     """Average the valid pixels of square blocks, of the width 2 half + 1, around CELLS.
 
     Args:
-        cut: From `own_depth`.
+        window: From `own_depth`, whose depth is in `cut`.
         circle: (3,) x, y, radius, px.
         half: Half width of a block, px.
-        means: (97, 4) out: mean u and v (px), mean depth (m) and its variance; 0 if none is valid.
-        counts: (97,) out: how many pixels are.
+        cut: Out: its blocks, whose numbers are 0 where no pixel is valid.
     """
-    own, left, top = cut
-    first = max(int(circle[0] - circle[2]) - half - left, 0)
-    last = min(first + int(2 * circle[2]) + 2 * half + 3, own.shape[1])
-    left, width, height = left + first, max(last - first, 0), len(own)
-    columns, cell = np.empty((4, width), np.float32), 0
-    middles = np.floor(circle[0] + circle[2] * _CENTERS + (0.5 - left)).astype(np.int64)
-    number, deep, square, low = columns[0], columns[1], columns[2], columns[3]
-    for a in range(GRID):
-        columns[:] = 0.0
-        v0 = int(np.floor(circle[1] + circle[2] * _CENTERS[a] + 0.5)) - top
-        for v in range(max(0, v0 - half), min(height, v0 + half + 1)):
-            row, below = own[v, first:last], Single(v - v0)
-            for u in range(len(row)):
-                z = max(row[u], Single(0))
-                valid = Single(1) if z > Single(0) else Single(0)
-                number[u] += valid
-                deep[u] += z
-                square[u] += z * z
-                low[u] += below * valid
-        for b in range(_SKIPPED[a], GRID - _SKIPPED[a]):
-            u0 = middles[b]
-            count, su, sv, sz, szz = Single(0), Single(0), Single(0), Single(0), Single(0)
-            for u in range(max(0, u0 - half), min(width, u0 + half + 1)):
-                count += number[u]
-                su += Single(u - u0) * number[u]
-                sv += low[u]
-                sz += deep[u]
-                szz += square[u]
-            counts[cell] = count
-            share = Single(1) / max(count, Single(1))
-            mean = sz * share
-            means[cell, 0], means[cell, 1] = left + u0 + su * share, top + v0 + sv * share
-            means[cell, 2], means[cell, 3] = mean, max(szz * share - mean * mean, Single(0))
-            cell += 1
+    blocks, pixels, own = cut.blocks, cut.pixels, cut.own
+    none, one = Single(0), Single(1)
+    left, top = np.int32(window.left), np.int32(window.top)
+    width, height = np.int32(window.width), np.int32(window.height)
+    for j in range(K):
+        pixels[j] = np.int32(np.floor(circle[0] + circle[2] * CELL_X[j] + 0.5)) - left
+        pixels[j + K] = np.int32(np.floor(circle[1] + circle[2] * CELL_Y[j] + 0.5)) - top
+        for i in range(5):
+            blocks[j + i * K] = none
+    for n in range((2 * half + 1) ** 2):
+        du, dv = np.int32(n % (2 * half + 1) - half), np.int32(n // (2 * half + 1) - half)
+        beside, below = Single(du), Single(dv)
+        for j in range(K):
+            u, v = pixels[j] + du, pixels[j + K] + dv
+            inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+            pixels[j + 2 * K] = v * width + u if inside else -1
+        for j in range(K):
+            z = own[max(pixels[j + 2 * K], 0)]
+            blocks[j + 5 * K] = z if pixels[j + 2 * K] >= 0 else none
+        for j in range(K):
+            z = max(blocks[j + 5 * K], none)
+            valid = one if z > none else none
+            blocks[j] += valid
+            blocks[j + U * K] += beside * valid
+            blocks[j + V * K] += below * valid
+            blocks[j + DEPTH * K] += z
+            blocks[j + SPREAD * K] += z * z
+    for j in range(K):
+        share = one / max(blocks[j], one)
+        mean = blocks[j + DEPTH * K] * share
+        blocks[j + U * K] = share * blocks[j + U * K] + Single(pixels[j] + left)
+        blocks[j + V * K] = share * blocks[j + V * K] + Single(pixels[j + K] + top)
+        blocks[j + DEPTH * K] = mean
+        blocks[j + SPREAD * K] = max(blocks[j + SPREAD * K] * share - mean * mean, none)
 
 
 @inlined
@@ -105,20 +155,31 @@ def enough(half: int) -> float:
     return ENOUGH * (2 * half + 1) ** 2
 
 
-@jit
-def middle_depth(means: Floats, counts: Floats, half: int, core: float) -> float:
+@borrower
+def middle_depth(cut: Cut, half: int, core: float) -> float:
     """Return the median depth (m) of the blocks near the centre, 0 without any.
 
     Args:
-        means: From `average`.
-        counts: From `average`.
+        cut: With blocks from `average`.
         half: Half width of a block, px.
         core: Squared share of the radius that is near.
     """
-    values, n = np.empty(len(means)), 0
-    for j in range(len(means)):
+    values, n = cut.values, 0
+    for j in range(len(CELLS)):
         near = CELLS[j, 0] ** 2 + CELLS[j, 1] ** 2 < core
-        if near and counts[j] > enough(half):
-            values[n] = means[j, 2]
+        if near and cut.blocks[j] > enough(half):
+            values[n] = cut.blocks[j + DEPTH * K]
             n += 1
-    return float(np.median(values[:n])) if n else 0.0
+    return median(values, n)
+
+
+@borrower
+def median(values: Singles, n: int) -> float:
+    """Return the median of the first n values, which it sorts; 0 without any."""
+    for i in range(1, n):
+        value, k = values[i], i
+        while k > 0 and values[k - 1] > value:
+            values[k] = values[k - 1]
+            k -= 1
+        values[k] = value
+    return 0.5 * float(values[(n - 1) // 2] + values[n // 2]) if n else 0.0

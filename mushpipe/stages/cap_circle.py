@@ -9,9 +9,10 @@ rays along its outline held the cap, and the worse it fits.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mushpipe.core.jit import jit
-from mushpipe.stages.cap_model import Floats, Singles
+from mushpipe.core.jit import borrower
+from mushpipe.stages.cap_model import Floats, Singles, Vector
 from mushpipe.stages.cap_outline import expected_reach
 from mushpipe.stages.cap_samples import COMPASS, DIRECTIONS
 
@@ -20,28 +21,27 @@ APART = 0.15  # distance of the two centres, in radii, at which that weight is h
 HELD = 16  # rays along depth edge and outline that hold a cap; with fewer it moves the circle less
 
 
-@jit
-def circle_around(circle: Floats, reach: Floats, out: Floats) -> None:
-    """Fill x, y, radius (3,) of the circle with an outline's centroid and area.
+@borrower
+def circle_around(circle: Floats, reach: Singles) -> Vector:
+    """Return x, y, radius of the circle with an outline's centroid and area.
 
     Of r(t) around a centre the area is A = 1/2 int r^2 dt, the centroid int r^3 (cos, sin) dt / 3A;
     sums over equal steps of t are exact for all that is smooth.
 
     Args:
         circle: (3,) whose centre the outline is seen from, px.
-        reach: (DIRECTIONS,) how far away it is from there in each direction of `COMPASS`, px.
-        out: Out, px.
+        reach: (DIRECTIONS or more,) how far away it is from there in each direction of `COMPASS`.
     """
     square = x = y = 0.0
     for j in range(DIRECTIONS):
         square += reach[j] ** 2
         x += reach[j] ** 3 * COMPASS[j, 0]
         y += reach[j] ** 3 * COMPASS[j, 1]
-    out[0], out[1] = circle[0] + x / (1.5 * square), circle[1] + y / (1.5 * square)
-    out[2] = np.sqrt(square / DIRECTIONS)
+    x, y = circle[0] + x / (1.5 * square), circle[1] + y / (1.5 * square)
+    return x, y, np.sqrt(square / DIRECTIONS)
 
 
-@jit
+@borrower
 def improve(
     circle: Floats,
     cap: Floats,
@@ -49,6 +49,7 @@ def improve(
     doubt: float,
     rays: Singles,
     focal: float,
+    room: tuple[Singles, NDArray[np.int32]],
 ) -> None:
     """Move a circle (3,) x, y, radius, px, towards the outline of its cap, in place.
 
@@ -60,10 +61,10 @@ def improve(
         doubt: 1 where the cap fits, larger where it fits badly.
         rays: (H, W, 2) rays at z = 1.
         focal: Focal length, px.
+        room: As in `sample_outline`.
     """
-    reach, outline = np.empty(DIRECTIONS), np.empty(3)
-    expected_reach(cap, rays, focal, circle, reach)
-    circle_around(circle, reach, outline)
+    expected_reach(cap, rays, focal, circle, *room)
+    outline = circle_around(circle, room[0])
     apart = np.hypot(outline[0] - circle[0], outline[1] - circle[1]) / (APART * outline[2])
     step = 1.0 - CLEAR * held[1] / DIRECTIONS / (1.0 + apart * apart)
     step *= min(1.0, (held[0] + held[1]) / HELD) ** 2 / doubt

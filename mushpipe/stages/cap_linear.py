@@ -6,36 +6,55 @@ from typing import Any
 
 import numpy as np
 
-from mushpipe.core.jit import inlined, jit
-from mushpipe.stages.cap_model import UNKNOWNS, Floats, Single, Singles
+from mushpipe.core.jit import borrower, inlined
+from mushpipe.stages.cap_model import ROOM, UNKNOWNS, Floats, Single, Singles, Vector
+
+Six = tuple[float, float, float, float, float, float]
 
 
-@jit
-def multiply(rows: Singles, count: int, system: Any) -> None:
+@borrower
+def multiply(flat: Singles, count: int, system: Any) -> None:
     """Fill the lower triangle of a normal matrix, and the gradient, from weighted rows.
 
     Args:
-        rows: (9 or more, M) derivatives and residual, times the root of their weight.
+        flat: (9 ROOM or more,) rows of ROOM: derivatives and residual, times the root of their
+            weight.
         count: How many columns are rows.
-        system: Normal matrix (8, 8) and gradient (8,), out.
+        system: Normal matrix (8, 8) and gradient (8,), out; above the diagonal there may be
+            anything.
     """
     normal, gradient = system
     for i in range(UNKNOWNS):
-        for j in range(i + 1):
-            normal[i, j] = dot(rows[i], rows[j], count)
-        gradient[i] = dot(rows[i], rows[UNKNOWNS], count)
+        for j in range(0, i + 1, 4):
+            products = dots(flat, i, j, count)
+            for k in range(4):
+                normal[i, j + k] = products[k]
+        gradient[i] = dot(flat, i, UNKNOWNS, count)
 
 
 @inlined
-def dot(a: Singles, b: Singles, count: int) -> float:
-    """Return the sum of the first `count` products."""
+def dots(flat: Singles, i: int, j: int, count: int) -> tuple[float, float, float, float]:
+    """Return the products of row i with rows j to j + 3; four at once read row i but once."""
+    a = b = c = d = np.float32(0)
+    for k in range(count):
+        x = flat[i * ROOM + k]
+        a += x * flat[j * ROOM + k]
+        b += x * flat[(j + 1) * ROOM + k]
+        c += x * flat[(j + 2) * ROOM + k]
+        d += x * flat[(j + 3) * ROOM + k]
+    return float(a), float(b), float(c), float(d)
+
+
+@inlined
+def dot(flat: Singles, i: int, j: int, count: int) -> float:
+    """Return the product of rows i and j."""
     total = np.float32(0)
     for k in range(count):
-        total += a[k] * b[k]
+        total += flat[i * ROOM + k] * flat[j * ROOM + k]
     return float(total)
 
 
-@jit
+@borrower
 def scale(rows: Singles, weights: Singles, count: int) -> None:
     """Multiply `count` columns of rows (9, M) by the roots of their weights (M,)."""
     for k in range(count):
@@ -45,17 +64,20 @@ def scale(rows: Singles, weights: Singles, count: int) -> None:
             rows[i, k] *= weights[k]
 
 
-@jit
+@borrower
 def cholesky(matrix: Floats) -> bool:
-    """Factor the lower triangle in place; False where it is not positive definite."""
+    """Factor the lower triangle in place; False where it is not positive definite.
+
+    The factor's diagonal is stored inverted: it is only ever divided by.
+    """
     for j in range(UNKNOWNS):
         pivot = matrix[j, j]
         for k in range(j):
             pivot -= matrix[j, k] * matrix[j, k]
         if not 1e-12 < pivot < 1e30:
             return False
-        matrix[j, j] = np.sqrt(pivot)
-        over = 1.0 / matrix[j, j]
+        over = 1.0 / np.sqrt(pivot)
+        matrix[j, j] = over
         for i in range(j + 1, UNKNOWNS):
             value = matrix[i, j]
             for k in range(j):
@@ -64,39 +86,51 @@ def cholesky(matrix: Floats) -> bool:
     return True
 
 
-@jit
+@borrower
 def substitute(factor: Floats, vector: Floats) -> None:
-    """Solve factor factor^T x = vector in place."""
+    """Solve factor factor^T x = vector in place, with a factor from `cholesky`."""
     for i in range(UNKNOWNS):
+        value = vector[i]
         for k in range(i):
-            vector[i] -= factor[i, k] * vector[k]
-        vector[i] /= factor[i, i]
+            value -= factor[i, k] * vector[k]
+        vector[i] = value * factor[i, i]
     for i in range(UNKNOWNS - 1, -1, -1):
+        value = vector[i]
         for k in range(i + 1, UNKNOWNS):
-            vector[i] -= factor[k, i] * vector[k]
-        vector[i] /= factor[i, i]
+            value -= factor[k, i] * vector[k]
+        vector[i] = value * factor[i, i]
 
 
-@jit
-def solve3(matrix: Floats, right: Floats, out: Floats) -> bool:
-    """Fill the solution (3,) of a symmetric system; False where it has none.
+@borrower
+def invert_factor(factor: Floats, first: int, last: int) -> None:
+    """Replace columns of a factor from `cholesky`, up to the last, by those of its inverse."""
+    for j in range(first, last + 1):
+        for i in range(j + 1, UNKNOWNS):
+            value = 0.0
+            for k in range(j, i):
+                value -= factor[i, k] * factor[k, j]
+            factor[i, j] = value * factor[i, i]
 
-    By Cramer's rule: numpy's solvers take seconds to compile into a kernel.
+
+@inlined
+def solve3(matrix: Six, right: Vector) -> tuple[bool, Vector]:
+    """Return whether a symmetric system of three equations has a solution, and it (Cramer's rule).
+
+    Args:
+        matrix: Its upper triangle, row by row.
+        right: Right side.
     """
-    a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
-    d, e, f = matrix[1, 1], matrix[1, 2], matrix[2, 2]
+    a, b, c, d, e, f = matrix
     p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
-    det = a * p + b * q + c * r
-    if not abs(det) > 1e-16:
-        return False
     s, t, u = a * f - c * c, b * c - a * e, a * d - b * b
-    out[0] = (p * right[0] + q * right[1] + r * right[2]) / det
-    out[1] = (q * right[0] + s * right[1] + t * right[2]) / det
-    out[2] = (r * right[0] + t * right[1] + u * right[2]) / det
-    return True
+    det = a * p + b * q + c * r
+    x = p * right[0] + q * right[1] + r * right[2]
+    y = q * right[0] + s * right[1] + t * right[2]
+    z = r * right[0] + t * right[1] + u * right[2]
+    return abs(det) > 1e-16, (x / det, y / det, z / det)
 
 
-@jit
+@borrower
 def tukey(squared: float, cut: float) -> float:
     """Return Tukey's weight of a squared, normalised residual."""
     rest: float = max(Single(1) - squared / cut, Single(0))  # as precise as what is given

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.jit import inlined, jit
+from mushpipe.core.jit import borrower, inlined
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -38,7 +38,7 @@ ROOM = 192
 UNKNOWNS = 8  # C (3), turn along e1 and e2 (2), R, h, b
 
 
-@jit
+@borrower
 def span(cap: Floats) -> None:
     """Fill e1 and e2 of a cap from its axis (Duff et al. 2017, without branches)."""
     x, y, z = cap[N], cap[N + 1], cap[N + 2]
@@ -49,7 +49,7 @@ def span(cap: Floats) -> None:
     cap[E2], cap[E2 + 1], cap[E2 + 2] = b, sign + y * y * a, -y
 
 
-@jit
+@borrower
 def move(cap: Floats, step: Floats) -> None:
     """Add a step (8,) to a cap and renew its axis and span."""
     norm = 0.0
@@ -67,12 +67,12 @@ def move(cap: Floats, step: Floats) -> None:
 
 @inlined
 def frozen(cap: Floats) -> Cap:
-    """Return axis, e1, e2, h/R, b and R of the array (15,) as a tuple of singles."""
+    """Return axis, e1, e2, R/h, b and R of the array (15,) as a tuple of singles."""
     return (
         Single(cap[3]), Single(cap[4]), Single(cap[5]),
         Single(cap[9]), Single(cap[10]), Single(cap[11]),
         Single(cap[12]), Single(cap[13]), Single(cap[14]),
-        Single(cap[HEIGHT] / cap[RADIUS]), Single(cap[BULGE]), Single(cap[RADIUS]),
+        Single(cap[RADIUS] / cap[HEIGHT]), Single(cap[BULGE]), Single(cap[RADIUS]),
     )  # fmt: skip
 
 
@@ -84,53 +84,53 @@ def dot(a: Vector, b: Vector) -> float:
 
 @inlined
 def enter(
-    q: Vector, ray: Vector, axis: Vector, k: float, tangent: bool
-) -> tuple[float, float, bool]:
-    """Return (t, s, hit) for one half of a cap, taken as a whole spheroid without bulge.
+    ray: Vector, q: Vector, axis: Vector, per_k: float, tangent: bool
+) -> tuple[float, float, float]:
+    """Return (top, A, free) for one half of a cap, taken as a whole spheroid without bulge.
 
     Solves A t^2 + 2 B t + G = F^2 - 1 = 0 for the point q + t ray.
 
     Args:
-        q: A point of the ray, from C in radii.
         ray: Unit vector.
+        q: A point of the ray, from C in radii.
         axis: Unit vector.
-        k: Half-axis along it, in radii.
+        per_k: 1 over the half-axis along it, per radius.
         tangent: Take the closest approach even where the ray hits.
 
     Returns:
-        Where the ray enters, or where it comes closest if it misses; the height of that point over
-        the rim plane; and whether it hits.
+        With A: t = top / A, where the ray enters, or where it comes closest if it misses; free > 0
+        if it hits.
     """
-    d = Single(1) / (k * k) - Single(1)
+    d = per_k * per_k - Single(1)
     un, qn = dot(ray, axis), dot(q, axis)
     a = Single(1) + d * un * un
     b = dot(q, ray) + d * un * qn
     g = dot(q, q) + d * qn * qn - Single(1)
     free = b * b - a * g
     root = np.sqrt(max(free, Single(0)))
-    t = -(b + (Single(0) if tangent else root)) / a
-    return t, t * un + qn, free > Single(0)
+    return -(b + (Single(0) if tangent else root)), a, free
 
 
 @inlined
 def meet(c: Cap, q: Vector, ray: Vector, tangent: bool) -> tuple[float, float, bool]:
-    """Return (t, k, hit): where a ray meets the cap, in which half, and whether it does at all."""
-    axis, lip = (c[0], c[1], c[2]), Single(LIP)
-    t, s, hit = enter(q, ray, axis, c[9], tangent)
-    t_lip, _, hit_lip = enter(q, ray, axis, lip, tangent)
-    dome = s > Single(0)
-    return (t if dome else t_lip), (c[9] if dome else lip), (hit if dome else hit_lip)
+    """Return (t, 1/k, hit): where a ray meets the cap, in which half, and whether it does."""
+    axis, per_lip = (c[0], c[1], c[2]), Single(1 / LIP)
+    top, a, free = enter(ray, q, axis, c[9], tangent)
+    top_lip, a_lip, free_lip = enter(ray, q, axis, per_lip, tangent)
+    dome = top * dot(ray, axis) + a * dot(q, axis) > Single(0)  # t ray.n + q.n, times A
+    t = (top if dome else top_lip) / (a if dome else a_lip)
+    return t, (c[9] if dome else per_lip), (free if dome else free_lip) > Single(0)
 
 
 @inlined
-def slope(c: Cap, q: Vector, ray: Vector, k: float) -> tuple[float, ...]:
-    """Return P = F - 1 - b w at the point q of a ray, in the half with half-axis k, and its change.
+def slope(c: Cap, q: Vector, ray: Vector, per_k: float) -> tuple[float, ...]:
+    """Return P = F - 1 - b w at the point q of a ray, in one half of the cap, and its change.
 
     Args:
         c: From `frozen`.
         q: From C in radii.
         ray: Unit vector.
-        k: In radii.
+        per_k: 1 over the half-axis of that half, per radius.
 
     Returns:
         P over |grad P|, m; 1 over |grad P|, in radii; and |cos| of incidence. Then the derivative
@@ -139,11 +139,12 @@ def slope(c: Cap, q: Vector, ray: Vector, k: float) -> tuple[float, ...]:
     """
     one, two, four, least = Single(1), Single(2), Single(4), Single(1e-12)
     axis, bulge, radius = (c[0], c[1], c[2]), c[10], c[11]
-    d, per_k = one / (k * k) - one, one / k
+    d = per_k * per_k - one
     s, square = dot(q, axis), dot(q, q)
     dome = one if s > Single(0) else Single(0)  # a factor: branches hinder SIMD
     by_half = s * s * per_k * per_k  # k is h on the dome and LIP R on the margin
-    per_f = one / np.sqrt(max(square + d * s * s, least))
+    square_f = max(square + d * s * s, least)  # F^2
+    per_f = one / np.sqrt(square_f)
     x = dome * by_half * per_f * per_f
     # w depends on F and on s: dP = own dF + by_s ds
     bend = dome * four * bulge * (one - two * x)
@@ -154,7 +155,7 @@ def slope(c: Cap, q: Vector, ray: Vector, k: float) -> tuple[float, ...]:
     w = four * x * (one - x)
     rim = max(square - s * s, Single(0))
     return (
-        (one / per_f - one - bulge * w) * over * radius,
+        (square_f * per_f - one - bulge * w) * over * radius,
         over,
         abs(dot(g, ray)) * over,
         -g[0] * over,
@@ -185,7 +186,7 @@ def beside(center: Vector, middle: float, per_radius: float, ray: Vector) -> Vec
     )
 
 
-@jit
+@borrower
 def fill_rows(cap: Floats, rays: Singles, count: int, flat: Singles) -> None:
     """Fill a column of rows for each ray.
 
@@ -214,10 +215,10 @@ def fill_rows(cap: Floats, rays: Singles, count: int, flat: Singles) -> None:
         far = flat[j + 13 * ROOM]
         touches = far == Single(0)
         q0, q1, q2 = beside((x, y, z), middle, per_radius, ray)
-        t, k, crosses = meet(c, (q0, q1, q2), ray, touches)
+        t, per_k, crosses = meet(c, (q0, q1, q2), ray, touches)
         hit = crosses & (not touches)
         q = (q0 + t * ray[0], q1 + t * ray[1], q2 + t * ray[2])
-        p, _, cosine, d0, d1, d2, d3, d4, d5, d6, d7 = slope(c, q, ray, k)
+        p, _, cosine, d0, d1, d2, d3, d4, d5, d6, d7 = slope(c, q, ray, per_k)
         flat[j], flat[j + ROOM], flat[j + 2 * ROOM], flat[j + 3 * ROOM] = d0, d1, d2, d3
         flat[j + 4 * ROOM], flat[j + 5 * ROOM] = d4, d5
         flat[j + 6 * ROOM], flat[j + 7 * ROOM] = d6, d7

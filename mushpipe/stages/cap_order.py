@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.jit import jit
+from mushpipe.core.jit import borrower, jit
+from mushpipe.stages.cap_blocks import median
 from mushpipe.stages.cap_model import Floats, Singles
 
 Order = tuple[NDArray[np.int64], NDArray[np.int16]]
 
 
-@jit
+@borrower
 def paint(ranks: NDArray[np.int16], circles: Floats, order: NDArray[np.int64]) -> None:
     """Write into each pixel the rank of the nearest circle that covers it.
 
@@ -29,10 +30,15 @@ def paint(ranks: NDArray[np.int16], circles: Floats, order: NDArray[np.int64]) -
             ranks[v, left : max(left, min(width, int(np.floor(x + half)) + 1))] = rank
 
 
-@jit
-def core_depth(depth: Singles, circle: Floats) -> float:
-    """Return the median depth (m) near the centre of a circle (x, y, r), 0 without any."""
-    values = np.empty(25)
+@borrower
+def core_depth(depth: Singles, circle: Floats, values: Singles) -> float:
+    """Return the median depth (m) near the centre of a circle (x, y, r), 0 without any.
+
+    Args:
+        depth: (H, W) m, missing where not above 0.
+        circle: (3,) x, y, radius, px.
+        values: (25,) room.
+    """
     n = 0
     for i in range(-2, 3):
         for j in range(-2, 3):
@@ -41,7 +47,7 @@ def core_depth(depth: Singles, circle: Floats) -> float:
             if 0 <= v < depth.shape[0] and 0 <= u < depth.shape[1] and depth[v, u] > 0:
                 values[n] = depth[v, u]
                 n += 1
-    return float(np.median(values[:n])) if n else 0.0
+    return median(values, n)
 
 
 def by_depth(depth: Singles, circles: Floats) -> Order:
@@ -57,9 +63,9 @@ def by_depth(depth: Singles, circles: Floats) -> Order:
 
 @jit
 def _rank(depth: Singles, circles: Floats, ranks: NDArray[np.int16]) -> NDArray[np.int64]:
-    far = np.empty(len(circles))
+    far, values = np.empty(len(circles)), np.empty(25, np.float32)
     for i in range(len(circles)):
-        far[i] = core_depth(depth, circles[i])
+        far[i] = core_depth(depth, circles[i], values)
         if far[i] <= 0.0:
             far[i] = 1e30  # hides nothing
     order = np.argsort(far)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.jit import jit
+from mushpipe.core.jit import borrower
 from mushpipe.stages.cap_model import RADIUS, Floats, Single, Singles, beside, frozen, meet, slope
 from mushpipe.stages.cap_samples import (
     COMPASS,
@@ -16,50 +16,35 @@ from mushpipe.stages.cap_samples import (
     EAST,
     EDGE_SHARE,
     SOUTH,
-    ray_at,
+    normalise,
+    place,
     touch,
 )
 
 STEP = 0.5  # px between places on a line
+WIDE = int(1.0 / STEP)  # steps to either side that a slope is taken over
 REACH = 12  # steps to either side that are looked at, at most
 EDGE = 1.01  # px, from a last place to the image's, rounding of single precision included
 LEAST_STEP = 0.04  # of luma, between 1 px inside and 1 px outside
+# Rows of DIRECTIONS in the room to work in. First how far the outline lies, px, 0 where it is not
+# looked for; then room for `expected_reach`, then for lines across it: first place, step, shares of
+# the next pixels, four pixels; then the luma by steps. `find_steepest` puts its finds in place of
+# the first places: by how much the luma falls at most, weighted, and at which step.
+X, Y, DX, DY, FX, FY, CORNERS = (k * DIRECTIONS for k in range(1, 8))
+BEST, PLACE, LINES = X, Y, CORNERS + 4 * DIRECTIONS
+LANES_ROOM = LINES + (2 * REACH + 1) * DIRECTIONS
+Lanes = tuple[Singles, NDArray[np.int32]]  # (LANES_ROOM,) and (2 DIRECTIONS,)
 
 
-@jit
-def look_along(
-    gray: Singles, x: float, y: float, turn: Floats, half: int, profile: Singles
-) -> bool:
-    """Fill the luma (2 half + 1,) along a line, bilinear; False where it leaves the image.
-
-    Args:
-        gray: (H, W) luma.
-        x: Of the middle of the line, px.
-        y: Likewise.
-        turn: (2,) its direction.
-        half: Number of steps to either side.
-        profile: Out.
-    """
-    far_x, far_y = half * STEP * abs(turn[0]), half * STEP * abs(turn[1])
-    if not (
-        far_x <= x < gray.shape[1] - EDGE - far_x and far_y <= y < gray.shape[0] - EDGE - far_y
-    ):
-        return False
-    one, dx, dy = np.uint32(1), Single(STEP * turn[0]), Single(STEP * turn[1])
-    left, top = Single(x - half * STEP * turn[0]), Single(y - half * STEP * turn[1])
-    for k in range(2 * half + 1):
-        at_x = max(left + Single(k) * dx, Single(0))
-        at_y = max(top + Single(k) * dy, Single(0))
-        u, v = np.uint32(at_x), np.uint32(at_y)
-        fx, fy = at_x - Single(u), at_y - Single(v)
-        up = gray[v, u] + fx * (gray[v, u + one] - gray[v, u])
-        low = gray[v + one, u] + fx * (gray[v + one, u + one] - gray[v + one, u])
-        profile[k] = up + fy * (low - up)
-    return True
-
-
-@jit
-def expected_reach(cap: Floats, rays: Singles, focal: float, circle: Floats, reach: Floats) -> None:
+@borrower
+def expected_reach(
+    cap: Floats,
+    rays: Singles,
+    focal: float,
+    circle: Floats,
+    row: Singles,
+    pixels: NDArray[np.int32],
+) -> None:
     """Fill how far (DIRECTIONS,), px, the outline of a cap lies from the centre of a circle.
 
     Two steps, each by how far outside of the outline the ray of the place found so far passes.
@@ -69,7 +54,8 @@ def expected_reach(cap: Floats, rays: Singles, focal: float, circle: Floats, rea
         rays: (H, W, 2) rays at z = 1; outside of the image as without distortion.
         focal: Focal length, px.
         circle: (3,) x, y, radius, px, near the outline.
-        reach: Out, per direction of `COMPASS`.
+        row: (5 DIRECTIONS or more,) room; out, in front, per direction of `COMPASS`.
+        pixels: (2 DIRECTIONS or more,) room.
     """
     c, half = frozen(cap), Single(0.5)
     x, y, z, per_radius = Single(cap[0]), Single(cap[1]), Single(cap[2]), Single(1 / cap[RADIUS])
@@ -77,9 +63,8 @@ def expected_reach(cap: Floats, rays: Singles, focal: float, circle: Floats, rea
     right, bottom = np.int32(rays.shape[1] - 1), np.int32(rays.shape[0] - 1)
     u0, v0, longest = Single(circle[0]), Single(circle[1]), Single(0.3 * circle[2])
     pixel = Single(focal / cap[2])
-    # in one array at fixed distances the compiler sees that nothing overlaps: SIMD
-    row, pixels = np.empty(5 * DIRECTIONS, np.float32), np.empty((2, DIRECTIONS), np.int32)
-    row[:DIRECTIONS] = Single(circle[2])
+    for j in range(DIRECTIONS):
+        row[j] = Single(circle[2])
     for _ in range(2):
         for j in range(DIRECTIONS):
             u, v = u0 + row[j] * EAST[j], v0 + row[j] * SOUTH[j]
@@ -87,50 +72,147 @@ def expected_reach(cap: Floats, rays: Singles, focal: float, circle: Floats, rea
             line = min(max(np.int32(np.floor(v + half)), np.int32(0)), bottom)
             row[j + DIRECTIONS] = (u - Single(column)) * per_focal
             row[j + 2 * DIRECTIONS] = (v - Single(line)) * per_focal
-            pixels[0, j], pixels[1, j] = column, line
+            pixels[j], pixels[j + DIRECTIONS] = column, line
         for j in range(DIRECTIONS):
-            near = rays[pixels[1, j], pixels[0, j]]
-            row[j + 3 * DIRECTIONS], row[j + 4 * DIRECTIONS] = near[0], near[1]
+            v, u = pixels[j + DIRECTIONS], pixels[j]
+            row[j + 3 * DIRECTIONS], row[j + 4 * DIRECTIONS] = rays[v, u, 0], rays[v, u, 1]
         for j in range(DIRECTIONS):
             across = row[j + 3 * DIRECTIONS] + row[j + DIRECTIONS]
             down = row[j + 4 * DIRECTIONS] + row[j + 2 * DIRECTIONS]
             along = Single(1) / np.sqrt(Single(1) + across * across + down * down)
             ray = (across * along, down * along, along)
             q0, q1, q2 = beside((x, y, z), middle, per_radius, ray)
-            t, k, _ = meet(c, (q0, q1, q2), ray, True)
-            outside = slope(c, (q0 + t * ray[0], q1 + t * ray[1], q2 + t * ray[2]), ray, k)[0]
+            t, per_k, _ = meet(c, (q0, q1, q2), ray, True)
+            q = (q0 + t * ray[0], q1 + t * ray[1], q2 + t * ray[2])
+            outside = slope(c, q, ray, per_k)[0]
             row[j] -= min(max(outside * pixel, -longest), longest)
-    reach[:] = row[:DIRECTIONS]
 
 
-@jit
-def steepest(profile: Singles, count: int, sign: float) -> tuple[float, float]:
-    """Return where a profile (count,) falls (sign 1) or rises (-1) most steeply, and by how much.
+@borrower
+def place_lines(
+    ranks: NDArray[np.int16], rank: int, circle: Floats, half: int, row: Singles,
+    pixels: NDArray[np.int32],
+) -> None:  # fmt: skip
+    """Place a line across the outline in each direction, if the image and the cap show it there.
 
-    The place is in steps, to a fraction of one by a parabola, and -1 where it lies at an end.
+    Args:
+        ranks: (H, W) rank of the nearest circle per pixel.
+        rank: This circle's; a place that a nearer one covers is left out.
+        circle: (3,) x, y, radius, px.
+        half: Number of steps to either side.
+        row: In and out: how far the outline is expected, then 0 where it is left out; lines.
+        pixels: Out: of the middles of the lines, -1 outside.
     """
-    wide = int(1.0 / STEP)
-    best, place = 0.0, -1
-    for k in range(wide, count - wide):
-        fall = sign * (profile[k - wide] - profile[k + wide])
+    height, width = np.int32(ranks.shape[0]), np.int32(ranks.shape[1])
+    right, bottom = Single(width) - Single(EDGE), Single(height) - Single(EDGE)
+    cx, cy, middle, none = Single(circle[0]), Single(circle[1]), Single(0.5), Single(0)
+    low, high = Single(0.5 * circle[2]), Single(1.6 * circle[2])
+    step, far = Single(STEP), Single(half * STEP)
+    for j in range(DIRECTIONS):
+        reach, east, south = row[j], EAST[j], SOUTH[j]
+        x, y, far_x, far_y = (
+            cx + reach * east,
+            cy + reach * south,
+            far * abs(east),
+            far * abs(south),
+        )
+        across = (far_x <= x) & (x < right - far_x) & (far_y <= y) & (y < bottom - far_y)
+        good = across & (low < reach) & (reach < high)
+        row[j + X], row[j + Y] = x - far * east if good else none, y - far * south if good else none
+        row[j + DX], row[j + DY] = step * east if good else none, step * south if good else none
+        pixel = np.int32(y + middle) * width + np.int32(x + middle)
+        pixels[j] = pixel if good else -1
+    every = ranks.reshape(-1)
+    for j in range(DIRECTIONS):
+        if pixels[j] < 0 or every[pixels[j]] < rank:
+            row[j] = none
+
+
+@borrower
+def look_along(gray: Singles, count: int, row: Singles, pixels: NDArray[np.int32]) -> float:
+    """Fill the luma along the lines, bilinear; return how much it falls along all of them.
+
+    Args:
+        gray: (H, W) luma, at least 2 by 2.
+        count: Number of steps.
+        row: (LANES_ROOM,) with lines from `place_lines`, in and out.
+        pixels: (DIRECTIONS or more,) room.
+    """
+    every, width, none = gray.reshape(-1), np.int32(gray.shape[1]), Single(0)
+    for k in range(count):
+        far, step = Single(k), LINES + k * DIRECTIONS
+        for j in range(DIRECTIONS):
+            x = max(row[j + X] + far * row[j + DX], none)
+            y = max(row[j + Y] + far * row[j + DY], none)
+            u, v = np.int32(x), np.int32(y)
+            row[j + FX], row[j + FY] = x - Single(u), y - Single(v)
+            pixels[j] = v * width + u
+        for j in range(DIRECTIONS):
+            p = max(pixels[j], 0)
+            row[j + CORNERS], row[j + CORNERS + DIRECTIONS] = every[p], every[p + 1]
+            row[j + CORNERS + 2 * DIRECTIONS] = every[p + width]
+            row[j + CORNERS + 3 * DIRECTIONS] = every[p + width + 1]
+        for j in range(DIRECTIONS):
+            a, b = row[j + CORNERS], row[j + CORNERS + DIRECTIONS]
+            c, d = row[j + CORNERS + 2 * DIRECTIONS], row[j + CORNERS + 3 * DIRECTIONS]
+            up, low = a + row[j + FX] * (b - a), c + row[j + FX] * (d - c)
+            row[j + step] = up + row[j + FY] * (low - up)
+    contrast, last = none, LINES + (count - 1) * DIRECTIONS
+    for j in range(DIRECTIONS):
+        contrast += row[j + LINES] - row[j + last] if row[j] > none else none
+    return float(contrast)
+
+
+@borrower
+def find_steepest(row: Singles, count: int, sign: float) -> None:
+    """Find where the luma falls (sign 1) or rises (-1) most steeply, in all directions at once.
+
+    Args:
+        row: (LANES_ROOM,) in and out.
+        count: Number of steps.
+        sign: Of what is looked for.
+    """
+    for j in range(DIRECTIONS):
+        row[j + BEST], row[j + PLACE] = Single(0), Single(-1)
+    for k in range(WIDE, count - WIDE):
         # of two equal steps the nearer one to where it is expected
-        fall *= 1.0 - 0.4 * abs(k - 0.5 * (count - 1)) / (0.5 * count)
-        if fall > best:
-            best, place = fall, k
-    if place <= wide or place >= count - wide - 1:
+        weight = Single(sign * (1.0 - 0.4 * abs(k - 0.5 * (count - 1)) / (0.5 * count)))
+        before, after, step = LINES + (k - WIDE) * DIRECTIONS, LINES + (k + WIDE) * DIRECTIONS, k
+        for j in range(DIRECTIONS):
+            fall = weight * (row[j + before] - row[j + after])
+            better = fall > row[j + BEST]
+            row[j + BEST] = fall if better else row[j + BEST]
+            row[j + PLACE] = Single(step) if better else row[j + PLACE]
+
+
+@borrower
+def vertex(row: Singles, j: int, count: int, sign: float) -> tuple[float, float]:
+    """Return the place of a steepest step, to a fraction of one by a parabola, and the fall there.
+
+    The place is -1 where it lies at an end.
+
+    Args:
+        row: (LANES_ROOM,) from `find_steepest`.
+        j: Number of the direction.
+        count: Number of steps.
+        sign: As in `find_steepest`.
+    """
+    place = int(row[j + PLACE])
+    if place <= WIDE or place >= count - WIDE - 1:
         return -1.0, 0.0
-    left = sign * (profile[place - 1 - wide] - profile[place - 1 + wide])
-    right = sign * (profile[place + 1 - wide] - profile[place + 1 + wide])
-    middle = sign * (profile[place - wide] - profile[place + wide])
+    at, wide = LINES + place * DIRECTIONS + j, WIDE * DIRECTIONS
+    left = sign * (row[at - DIRECTIONS - wide] - row[at - DIRECTIONS + wide])
+    right = sign * (row[at + DIRECTIONS - wide] - row[at + DIRECTIONS + wide])
+    middle = sign * (row[at - wide] - row[at + wide])
     bend = left - 2.0 * middle + right
     shift = 0.5 * (left - right) / bend if bend < -1e-9 else 0.0
     return place + min(max(shift, -0.5), 0.5), middle
 
 
-@jit
+@borrower
 def sample_outline(
     gray: Singles, rays: Singles, ranks: NDArray[np.int16], rank: int, cap: Floats, circle: Floats,
-    focal: float, sigma: float, out: Singles,
+    focal: float, sigma: float, room: Lanes, out: Singles,
 ) -> int:  # fmt: skip
     """Find the outline of a cap in the colour image, in 32 directions.
 
@@ -143,36 +225,30 @@ def sample_outline(
         circle: (3,) x, y, radius, px.
         focal: Focal length, px.
         sigma: Of a place on the outline, px.
+        room: To work in.
         out: (6, DIRECTIONS) out: rays that touch the cap, as in `touch`.
 
     Returns:
         Number of rays.
     """
-    profiles, reaches = np.empty((DIRECTIONS, 2 * REACH + 1), np.float32), np.empty(DIRECTIONS)
-    expected_reach(cap, rays, focal, circle, reaches)
+    (row, pixels), n = room, 0
+    if min(gray.shape) < 2:
+        return 0
+    expected_reach(cap, rays, focal, circle, row, pixels)
     half = min(REACH, max(5, int(0.2 * circle[2] / STEP)))
-    count, contrast = 2 * half + 1, 0.0
+    count = 2 * half + 1
+    place_lines(ranks, rank, circle, half, row, pixels)
+    sign = 1.0 if look_along(gray, count, row, pixels) > 0 else -1.0
+    find_steepest(row, count, sign)
     for j in range(DIRECTIONS):
-        turn, reach = COMPASS[j], reaches[j]
-        reaches[j] = 0.0
-        if not 0.5 * circle[2] < reach < 1.6 * circle[2]:
+        if row[j] == 0.0:
             continue
-        x, y = circle[0] + reach * turn[0], circle[1] + reach * turn[1]
-        u, v = int(np.floor(x + 0.5)), int(np.floor(y + 0.5))
-        if not (0 <= u < ranks.shape[1] and 0 <= v < ranks.shape[0]) or ranks[v, u] < rank:
+        step, fall = vertex(row, j, count, sign)
+        if step < 0.0 or fall < LEAST_STEP:
             continue
-        if look_along(gray, x, y, turn, half, profiles[j]):
-            reaches[j] = reach
-            contrast += profiles[j, 0] - profiles[j, count - 1]
-    n = 0
-    for j in range(DIRECTIONS):
-        if reaches[j] == 0.0:
-            continue
-        place, fall = steepest(profiles[j], count, 1.0 if contrast > 0 else -1.0)
-        if place < 0.0 or fall < LEAST_STEP:
-            continue
-        reach = reaches[j] + (place - half) * STEP
+        reach = row[j] + (step - half) * STEP
         x, y = circle[0] + reach * COMPASS[j, 0], circle[1] + reach * COMPASS[j, 1]
-        touch(out, n, ray_at(rays, focal, x, y), sigma * cap[2] / focal, EDGE_SHARE)
+        touch(out, n, place(rays, focal, x, y), sigma * cap[2] / focal, EDGE_SHARE)
         n += 1
+    normalise(out, 0, n)
     return n

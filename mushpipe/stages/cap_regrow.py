@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from mushpipe.core.jit import jit
+from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.cap_linear import tukey
-from mushpipe.stages.cap_model import HEIGHT, RADIUS, Floats, N
+from mushpipe.stages.cap_model import HEIGHT, RADIUS, Floats, N, Singles
 from mushpipe.stages.cap_samples import COMPASS, DIRECTIONS
 from mushpipe.stages.linear import solve
 
@@ -20,7 +20,7 @@ ROUNDS = 8
 HELD = np.array([0.02, 0.02, 0.05])  # weight of the detected x, y and radius, that of an end is 1
 
 
-@jit
+@borrower
 def look(image: Any, circle: Floats, j: int, far: float) -> tuple[float, int]:
     """Return depth (m, 0 = missing) and rank (-1 out of the image) in a direction of `COMPASS`.
 
@@ -38,9 +38,9 @@ def look(image: Any, circle: Floats, j: int, far: float) -> tuple[float, int]:
     return 0.0, -1
 
 
-@jit
+@borrower
 def denials(
-    image: Any, ranks: tuple[int, int], cap: Floats, bias: float, circle: Floats, reach: Floats
+    image: Any, ranks: tuple[int, int], cap: Floats, bias: float, circle: Floats, reach: Singles
 ) -> int:
     """Return in how many directions depth denies the outline of a fitted cap.
 
@@ -52,7 +52,7 @@ def denials(
         cap: (15,) the cap.
         bias: Of the depth, m.
         circle: (3,) x, y, radius, px.
-        reach: (DIRECTIONS,) how far the outline lies from the circle's centre, px.
+        reach: (DIRECTIONS or more,) how far the outline lies from the circle's centre, px.
     """
     rim = cap[2] + bias
     low, high = rim + cap[HEIGHT] * cap[N + 2] - 0.3 * cap[RADIUS], rim + 0.5 * cap[RADIUS]
@@ -68,7 +68,7 @@ def denials(
     return count
 
 
-@jit
+@borrower
 def end_along(
     image: Any, ranks: tuple[int, int], circle: Floats, j: int, gate: tuple[float, float, float]
 ) -> float:

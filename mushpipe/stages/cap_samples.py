@@ -6,12 +6,26 @@ numbers.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import NDArray
 
-from mushpipe.core.jit import jit
-from mushpipe.stages.cap_blocks import CELLS, GRID, average, enough, middle_depth
+from mushpipe.core.jit import borrower
+from mushpipe.stages.cap_blocks import (
+    CELLS,
+    COUNT,
+    DEPTH,
+    GRID,
+    SPREAD,
+    Cut,
+    K,
+    U,
+    V,
+    Window,
+    average,
+    enough,
+    half_width,
+    middle_depth,
+)
 from mushpipe.stages.cap_model import Floats, Single, Singles, Vector
 
 DIRECTIONS = 32
@@ -29,59 +43,70 @@ COMPASS: Floats = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=-1)
 EAST, SOUTH = np.cos(_TURN).astype(np.float32), np.sin(_TURN).astype(np.float32)
 
 
-@jit
+@borrower
 def sample_depth(
-    cut: Any,
+    window: Window,
+    cut: Cut,
     rays: Singles,
     circle: Floats,
     focal: float,
-    noise: tuple[float, float],
+    sensor: tuple[float, float, float, float],
     out: Singles,
 ) -> tuple[int, int, float]:
     """Take the points of a cap: block means on a grid inside its circle, gated around its depth.
 
     Args:
-        cut: From `own_depth`.
+        window: From `own_depth`, whose depth is in `cut`.
+        cut: Room.
         rays: (H, W, 2) rays at z = 1, beyond 1e3 where a pixel has none.
         circle: (3,) x, y, radius, px.
         focal: Focal length, px.
-        noise: Sigma of depth is noise[0] + noise[1] z, m.
-        out: (6, M) out: unit ray, range and its sigma (m), share that counts as independent.
+        sensor: Sigma of depth is sensor[0] + sensor[1] z, m; its bias is sensor[2], m.
+        out: (6, M) out: x and y of the ray at z = 1, 1; z and its sigma (m), share that counts as
+            independent.
 
     Returns:
         Number of points, number of those outside of the gate, and the cap's middle depth (m), 0
         where there is none.
     """
-    radius = circle[2]
-    half = max(0, int(np.floor(radius / GRID)))
-    points, count = np.empty((len(CELLS), 4)), np.empty(len(CELLS))
-    average(cut, circle, half, points, count)
-    middle = middle_depth(points, count, half, CORE)
+    radius, blocks = circle[2], cut.blocks
+    half = half_width(radius, rays.shape[:2])
+    average(window, circle, half, cut)
+    middle = middle_depth(cut, half, CORE)
     if middle <= 0.0:
         return 0, 0, 0.0
     size = radius * middle / focal
+    low, high, least = middle - 0.8 * size, middle + size, enough(half)
+    step = (0.6 * size * (2 * half + 1) / radius) ** 2
     n, other = 0, 0
     for j in range(len(CELLS)):
-        z = points[j, 2]
-        sigma = noise[0] + noise[1] * z
-        even = (2.5 * sigma) ** 2 + (0.6 * size * (2 * half + 1) / radius) ** 2
-        if count[j] <= enough(half) or points[j, 3] > even:
+        z = blocks[j + DEPTH * K]
+        sigma = sensor[0] + sensor[1] * z
+        even = (2.5 * sigma) ** 2 + step
+        if blocks[j + COUNT * K] <= least or blocks[j + SPREAD * K] > even:
             continue
-        if not middle - 0.8 * size < z < middle + size:
+        if not low < z < high:
             other += 1
             continue
-        ray = ray_at(rays, focal, points[j, 0], points[j, 1])
-        if ray[2] < 1e-3:
+        x, y = place(rays, focal, blocks[j + U * K], blocks[j + V * K])
+        if abs(x) > 1e3:
             continue  # where the lens has none
-        out[0, n], out[1, n], out[2, n], out[3, n] = ray[0], ray[1], ray[2], z / ray[2]
-        out[4, n] = sigma * (0.3 + 0.7 / np.sqrt(count[j])) / ray[2]
+        out[0, n], out[1, n], out[2, n], out[3, n] = x, y, 1.0, z - sensor[2]
+        out[4, n] = sigma * (0.3 + 0.7 / np.sqrt(blocks[j + COUNT * K]))
         out[5, n] = POINT_SHARE
         n += 1
     return n, other, middle
 
 
-@jit
-def follow(cut: Any, circle: Floats, gate: tuple[float, float], state: Singles) -> None:
+@borrower
+def follow(
+    window: Window,
+    own: Singles,
+    circle: Floats,
+    gate: tuple[float, float],
+    state: Singles,
+    pixels: NDArray[np.int32],
+) -> None:
     """Find the last step of a cap in each direction, where its edge is to be trusted.
 
     The edge is the maximum of a running sum that rewards what lies within the cap's depth and
@@ -89,19 +114,21 @@ def follow(cut: Any, circle: Floats, gate: tuple[float, float], state: Singles) 
     where something deeper follows within 4 steps, for there the cap ends and is not merely hidden.
 
     Args:
-        cut: From `own_depth`.
+        window: From `own_depth`.
+        own: (H W,) its depth.
         circle: (3,) x, y, radius, px.
         gate: Depths of the cap, m.
-        state: (6 DIRECTIONS,) out, rows of DIRECTIONS: whether it goes on, the sum, its maximum,
-            the step of that (-1 without), and what follows it: 1 something deeper, -1 something
-            nearer, 0 neither yet; then the depth at the last step. In one array at fixed distances
-            the compiler sees that nothing overlaps, and works on several directions at once.
+        state: (6 DIRECTIONS or more,) out, rows of DIRECTIONS: whether it goes on, the sum, its
+            maximum, the step of that (-1 without), and what follows it: 1 something deeper, -1
+            something nearer, 0 neither yet; then the depth at the last step. In one array at fixed
+            distances the compiler sees that nothing overlaps, and works on several directions at
+            once.
+        pixels: (DIRECTIONS or more,) room.
     """
-    own, (height, width) = cut[0].reshape(-1), cut[0].shape
+    width, height = np.int32(window.width), np.int32(window.height)
     none, one, low, high = Single(0), Single(1), Single(gate[0]), Single(gate[1])
     half, little, four = Single(0.5), Single(0.15), Single(4)
-    x, y = Single(circle[0] - cut[1] + 0.5), Single(circle[1] - cut[2] + 0.5)
-    pixels = np.empty(DIRECTIONS, np.int32)
+    x, y = Single(circle[0] - window.left + 0.5), Single(circle[1] - window.top + 0.5)
     for j in range(DIRECTIONS):
         state[j], state[j + DIRECTIONS], state[j + 2 * DIRECTIONS] = one, none, none
         state[j + 3 * DIRECTIONS], state[j + 4 * DIRECTIONS] = -one, none
@@ -112,7 +139,9 @@ def follow(cut: Any, circle: Floats, gate: tuple[float, float], state: Singles) 
             inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
             pixels[j] = v * width + u if inside else -1
         for j in range(DIRECTIONS):
-            state[j + 5 * DIRECTIONS] = own[pixels[j]] if pixels[j] >= 0 else none
+            z = own[max(pixels[j], 0)]
+            state[j + 5 * DIRECTIONS] = z if pixels[j] >= 0 else none
+        going = none
         for j in range(DIRECTIONS):
             on, total = state[j] > none, state[j + DIRECTIONS]
             best, edge = state[j + 2 * DIRECTIONS], state[j + 3 * DIRECTIONS]
@@ -130,39 +159,42 @@ def follow(cut: Any, circle: Floats, gate: tuple[float, float], state: Singles) 
             state[j], state[j + DIRECTIONS] = one if on else none, total
             state[j + 2 * DIRECTIONS], state[j + 3 * DIRECTIONS] = best, edge
             state[j + 4 * DIRECTIONS] = none if top else follows
-        going = none
-        for j in range(DIRECTIONS):
-            going += state[j]
+            going += one if on else none
         if going == none:
             break
 
 
-@jit
+@borrower
 def sample_edges(
-    cut: Any,
+    window: Window,
+    own: Singles,
     rays: Singles,
     circle: Floats,
     focal: float,
     middle: float,
     offset: float,
+    room: tuple[Singles, NDArray[np.int32]],
     out: Singles,
 ) -> int:
     """Find the depth edge of a cap in 32 directions.
 
     Args:
-        cut: From `own_depth`, not empty.
+        window: From `own_depth`, not empty.
+        own: (H W,) its depth.
         rays: (H, W, 2) rays at z = 1.
         circle: (3,) x, y, radius, px.
         focal: Focal length, px.
         middle: Middle depth of the cap, m.
         offset: How much of its edge the sensor loses, px.
+        room: As `state` and `pixels` of `follow`.
         out: (6, DIRECTIONS) out: rays that touch the cap, as in `touch`.
 
     Returns:
         Number of trusted edge rays.
     """
-    size, state = circle[2] * middle / focal, np.empty(6 * DIRECTIONS, np.float32)
-    follow(cut, circle, (middle - 0.8 * size, middle + 0.95 * size), state)
+    size, state = circle[2] * middle / focal, room[0]
+    gate = (middle - 0.8 * size, middle + 0.95 * size)
+    follow(window, own, circle, gate, state, room[1])
     n = 0
     for j in range(DIRECTIONS):
         edge = state[j + 3 * DIRECTIONS]
@@ -170,23 +202,66 @@ def sample_edges(
             continue
         reach = circle[2] * (INNER + (edge + 0.5) * STEP) + offset
         x, y = circle[0] + reach * COMPASS[j, 0], circle[1] + reach * COMPASS[j, 1]
-        touch(out, n, ray_at(rays, focal, x, y), EDGE_PX * middle / focal, EDGE_SHARE)
+        touch(out, n, place(rays, focal, x, y), EDGE_PX * middle / focal, EDGE_SHARE)
         n += 1
     return n
 
 
-@jit
-def touch(out: Singles, n: int, ray: Vector, sigma: float, share: float) -> None:
-    """Fill column n of rays (6, M) with one that touches the cap, within sigma (m)."""
-    out[0, n], out[1, n], out[2, n] = ray
+@borrower
+def touch(out: Singles, n: int, at: tuple[float, float], sigma: float, share: float) -> None:
+    """Fill column n of rays (6, M) with one that touches the cap, within sigma (m).
+
+    Args:
+        out: Rays.
+        n: Number of the column.
+        at: x and y of the ray at z = 1; `normalise` makes it a unit ray.
+        sigma: m.
+        share: That counts as independent.
+    """
+    out[0, n], out[1, n], out[2, n] = at[0], at[1], 1.0
     out[3, n], out[4, n], out[5, n] = 0.0, sigma, share
 
 
-@jit
-def ray_at(rays: Singles, focal: float, x: float, y: float) -> Vector:
-    """Return the unit ray of a place in the image (px); outside of it, as without distortion."""
+@borrower
+def normalise(rays: Singles, first: int, last: int) -> None:
+    """Make unit rays of columns (6, M) that hold rays at z = 1, depths and their sigmas.
+
+    Ranges and their sigmas take the place of depths; rays that touch keep what they have.
+
+    Args:
+        rays: In and out.
+        first: Number of the first column.
+        last: Past the last.
+    """
+    one, none = Single(1), Single(0)
+    for j in range(first, last):
+        length = np.sqrt(one + rays[0, j] * rays[0, j] + rays[1, j] * rays[1, j])
+        short = one / length
+        rays[4, j] *= length if rays[3, j] > none else one
+        rays[0, j] *= short
+        rays[1, j] *= short
+        rays[2, j] = short
+        rays[3, j] *= length
+
+
+@borrower
+def place(rays: Singles, focal: float, x: float, y: float) -> tuple[float, float]:
+    """Return the ray at z = 1 of a place in the image (px); outside of it, as without distortion.
+
+    Args:
+        rays: (H, W, 2) of all pixels.
+        focal: Focal length, px.
+        x: px.
+        y: px.
+    """
     v = min(max(int(np.floor(y + 0.5)), 0), rays.shape[0] - 1)
     u = min(max(int(np.floor(x + 0.5)), 0), rays.shape[1] - 1)
-    rx, ry = rays[v, u, 0] + (x - u) / focal, rays[v, u, 1] + (y - v) / focal
+    return rays[v, u, 0] + (x - u) / focal, rays[v, u, 1] + (y - v) / focal
+
+
+@borrower
+def ray_at(rays: Singles, focal: float, x: float, y: float) -> Vector:
+    """Return the unit ray of a place in the image; arguments as `place`."""
+    rx, ry = place(rays, focal, x, y)
     length = np.sqrt(1.0 + rx * rx + ry * ry)
     return rx / length, ry / length, 1.0 / length

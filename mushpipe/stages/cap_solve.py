@@ -6,8 +6,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mushpipe.core.jit import jit
-from mushpipe.stages.cap_linear import cholesky, multiply, scale, substitute, tukey
+from mushpipe.core.jit import borrower, jit
+from mushpipe.stages.cap_linear import (
+    cholesky,
+    invert_factor,
+    multiply,
+    scale,
+    substitute,
+    tukey,
+)
 from mushpipe.stages.cap_model import (
     BULGE,
     E1,
@@ -21,6 +28,7 @@ from mushpipe.stages.cap_model import (
     N,
     Single,
     Singles,
+    Vector,
     fill_rows,
     move,
 )
@@ -60,7 +68,7 @@ class Noise(NamedTuple):
     usual: float
 
 
-@jit
+@borrower
 def weigh(
     rows: Floats, rays: Singles, count: int, noise: Any, pixel: float, radius: float, step: int,
     weights: Floats,
@@ -108,7 +116,7 @@ def weigh(
     return float(total), misfit / max(float(shares), 1e-9)
 
 
-@jit
+@borrower
 def weigh_circle(rows: Floats, variance: float, cut: float, weights: Floats) -> None:
     """Put the detected circle's three numbers in the place of its rays' rows, the first ROUND.
 
@@ -128,8 +136,8 @@ def weigh_circle(rows: Floats, variance: float, cut: float, weights: Floats) -> 
         weights[w] = precision * tukey(rows[UNKNOWNS, w] ** 2 * precision, cut)
 
 
-@jit
-def tilt(cap: Floats, up: Floats) -> tuple[float, float]:
+@borrower
+def tilt(cap: Floats, up: Vector) -> tuple[float, float]:
     """Return the turn along e1 and e2 (rad) that takes the upright to a cap's axis."""
     cosine = min(max(cap[N] * up[0] + cap[N + 1] * up[1] + cap[N + 2] * up[2], -1.0), 1.0)
     stretch = -np.arccos(cosine) / np.sqrt(max(1.0 - cosine * cosine, 1e-18))
@@ -138,8 +146,8 @@ def tilt(cap: Floats, up: Floats) -> tuple[float, float]:
     return stretch * first, stretch * second
 
 
-@jit
-def add_priors(cap: Floats, upright: tuple[Floats, float], noise: Any, system: Any) -> None:
+@borrower
+def add_priors(cap: Floats, upright: tuple[Vector, float], noise: Any, system: Any) -> None:
     """Add what is known of any cap: aspect, bulge, and that it grows upwards, more or less."""
     normal, gradient = system
     weight = 1.0 / (noise.aspect_sigma * cap[RADIUS]) ** 2
@@ -157,7 +165,7 @@ def add_priors(cap: Floats, upright: tuple[Floats, float], noise: Any, system: A
     gradient[7] += (cap[BULGE] - noise.bulge) / noise.bulge_sigma**2
 
 
-@jit
+@borrower
 def limit(cap: Floats, step: Floats, size: float) -> None:
     """Shorten a step that leaves the range in which the model is meant."""
     length = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
@@ -183,7 +191,7 @@ def workspace() -> Any:
     return system, flat, flat.reshape(14, ROOM), np.empty(ROOM, np.float32)
 
 
-@jit
+@borrower
 def fill_up(rays: Singles, count: int) -> int:
     """Fill rays (6, M) that count nothing up to the next multiple of LANES; return that."""
     padded = (count + LANES - 1) // LANES * LANES
@@ -193,12 +201,12 @@ def fill_up(rays: Singles, count: int) -> int:
     return padded
 
 
-@jit
+@borrower
 def refine(
     cap: Floats,
     rays: Singles,
     count: int,
-    upright: tuple[Floats, float],
+    upright: tuple[Vector, float],
     settings: tuple[Any, float, float],
     steps: tuple[int, int],
     work: Any,
@@ -209,7 +217,7 @@ def refine(
         cap: (15,) the estimate, in and out.
         rays: (6, M) as in `weigh`; the first ROUND lie around the detected circle.
         count: How many columns are rays.
-        upright: Unit vector (3,) and the spread of tilts off it, rad.
+        upright: Unit vector and the spread of tilts off it, rad.
         settings: `Noise`, the angle of a pixel (rad), and the size of the circle at the cap (m).
         steps: Numbers of the first step and past the last.
         work: From `workspace`.
@@ -228,7 +236,7 @@ def refine(
         variance = (noise.circle_px * pixel * cap[2]) ** 2 + (noise.outline * cap[RADIUS]) ** 2
         weigh_circle(rows, variance, TOUCH_CUTS[min(step, STEPS - 1)], weights)
         scale(rows, weights, padded)
-        multiply(rows, padded, system)
+        multiply(flat, padded, system)
         add_priors(cap, upright, noise, system)
         if not cholesky(normal):
             return -1.0, misfit
@@ -240,25 +248,28 @@ def refine(
     return total, misfit
 
 
-@jit
+@borrower
 def variance_of_tilt(factor: Floats) -> float:
-    """Return the variance of the tilt, rad^2, per direction, from a matrix `cholesky` factored."""
-    total, column = 0.0, np.empty(UNKNOWNS)
+    """Return the variance of the tilt, rad^2, per direction, from a matrix `cholesky` factored.
+
+    Two columns of the matrix give way to those of its inverse.
+    """
+    invert_factor(factor, 3, 4)
+    total = 0.0
     for turn in (3, 4):
         # the diagonal of the inverse: the squared columns of that of the factor
         for i in range(turn, UNKNOWNS):
-            value = 1.0 if i == turn else 0.0
-            for k in range(turn, i):
-                value -= factor[i, k] * column[k]
-            column[i] = value / factor[i, i]
-            total += column[i] * column[i]
+            total += factor[i, turn] * factor[i, turn]
     return 0.5 * total
 
 
-@jit
+@borrower
 def invert(factor: Floats, out: Floats) -> None:
-    """Fill the inverse (8, 8) of a matrix that `cholesky` has factored."""
+    """Fill the inverse (8, 8) of a matrix that `cholesky` has factored; the factor is lost."""
+    invert_factor(factor, 0, UNKNOWNS - 1)
     for i in range(UNKNOWNS):
-        out[i, :] = 0.0
-        out[i, i] = 1.0
-        substitute(factor, out[i])
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(i, UNKNOWNS):
+                total += factor[k, i] * factor[k, j]
+            out[i, j] = out[j, i] = total

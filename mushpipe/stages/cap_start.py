@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mushpipe.core.jit import jit
+from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.cap_linear import solve3
 from mushpipe.stages.cap_model import BULGE, HEIGHT, RADIUS, Floats, N, Singles, Vector, span
 
@@ -17,69 +17,62 @@ PRIOR_CAPS = 0.1  # the spread that is set counts as much as so many caps
 NARROWEST = np.radians(2.0)
 
 
-@jit
-def plane(points: Singles, count: int, ray: Vector, out: Floats) -> bool:
-    """Fill the unit normal (3,), towards the camera, of the plane through points (6, M)."""
-    matrix, right = np.zeros((3, 3)), np.zeros(3)
+@borrower
+def plane(points: Singles, count: int, ray: Vector) -> tuple[bool, Vector]:
+    """Return whether points (6, M) determine a plane, and its unit normal, towards the camera."""
+    xx = xy = yy = x = y = xz = yz = z = 0.0
     for j in range(count):
         far = points[3, j]
-        row = (far * (points[0, j] - ray[0]), far * (points[1, j] - ray[1]), 1.0)
-        for i in range(3):
-            right[i] += row[i] * far * points[2, j]
-            for k in range(3):
-                matrix[i, k] += row[i] * row[k]
-    if not solve3(matrix, right, out):
-        return False
-    x, y = out[0], out[1]
-    norm = np.sqrt(x * x + y * y + 1.0)
-    out[0], out[1], out[2] = x / norm, y / norm, -1.0 / norm
-    return True
+        across, down = far * (points[0, j] - ray[0]), far * (points[1, j] - ray[1])
+        deep = far * points[2, j]
+        xx, xy, yy = xx + across * across, xy + across * down, yy + down * down
+        x, y = x + across, y + down
+        xz, yz, z = xz + across * deep, yz + down * deep, z + deep
+    found, (a, b, _) = solve3((xx, xy, x, yy, y, float(count)), (xz, yz, z))
+    norm = np.sqrt(a * a + b * b + 1.0)
+    return found, (a / norm, b / norm, -1.0 / norm)
 
 
-@jit
-def lean(axis: Floats, ray: Vector, aspect: float) -> None:
-    """Turn an axis (3,) further away from the line of sight, as a cap leans more than its plane.
+@borrower
+def lean(axis: Vector, ray: Vector, aspect: float) -> Vector:
+    """Turn an axis further away from the line of sight: a cap leans more than its plane.
 
     The plane through a spheroid's visible points leans 1 - aspect^2 times as much as its axis.
     """
     cosine = -(axis[0] * ray[0] + axis[1] * ray[1] + axis[2] * ray[2])
-    across = np.empty(3)
-    for i in range(3):
-        across[i] = axis[i] + cosine * ray[i]
-    sine = np.sqrt(across[0] ** 2 + across[1] ** 2 + across[2] ** 2)
+    x, y, z = axis[0] + cosine * ray[0], axis[1] + cosine * ray[1], axis[2] + cosine * ray[2]
+    sine = np.sqrt(x * x + y * y + z * z)
     if sine < 1e-6:
-        return
+        return axis
     angle = min(np.arctan2(sine, cosine) / (1.0 - aspect**2), STEEPEST)
-    for i in range(3):
-        axis[i] = across[i] / sine * np.sin(angle) - ray[i] * np.cos(angle)
+    across, along = np.sin(angle) / sine, np.cos(angle)
+    return across * x - along * ray[0], across * y - along * ray[1], across * z - along * ray[2]
 
 
-@jit
-def axis_of(points: Singles, count: int, up: Floats, ray: Vector, aspect: float) -> Floats:
-    """Return the axis (3,) to start with: from the plane through points (6, M), `up` without one.
+@borrower
+def axis_of(points: Singles, count: int, up: Vector, ray: Vector, aspect: float) -> Vector:
+    """Return the axis to start with: from the plane through points (6, M), `up` without one.
 
     Args:
         points: (6, M) unit rays and range, m.
         count: How many columns are points.
-        up: (3,) unit.
+        up: Unit.
         ray: Unit, through the circle's centre.
         aspect: h/R of the cap.
     """
-    axis = up.copy()
-    if plane(points, count, ray, axis):
-        lean(axis, ray, aspect)
-    return axis
+    found, normal = plane(points, count, ray)
+    return lean(normal, ray, aspect) if found else up
 
 
-@jit
+@borrower
 def start(
-    cap: Floats, axis: Floats, form: tuple[float, float], ray: Vector, middle: float, size: float
+    cap: Floats, axis: Vector, form: tuple[float, float], ray: Vector, middle: float, size: float
 ) -> None:
     """Fill a cap (15,) from its circle.
 
     Args:
         cap: (15,) out.
-        axis: (3,) unit.
+        axis: Unit.
         form: Aspect h/R and bulge.
         ray: Unit, through the circle's centre.
         middle: Middle depth of the cap, m.

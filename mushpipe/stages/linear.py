@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.jit import jit
+from mushpipe.core.jit import borrower, jit
 
 Floats = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ def normal_equations(columns: Floats, target: Floats, weight: Floats) -> tuple[F
     return normal, right
 
 
-@jit
+@borrower
 def solve(a: Floats, b: Floats) -> None:
     """Solve a x = b in place for a small positive definite matrix; x replaces b."""
     size = len(b)

@@ -7,8 +7,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.jit import jit
-from mushpipe.stages.cap_blocks import CELLS, GRID, average, enough, middle_depth, own_depth
+from mushpipe.core.jit import borrower, jit
+from mushpipe.stages.cap_blocks import (
+    CELLS,
+    DEPTH,
+    SPREAD,
+    K,
+    U,
+    V,
+    average,
+    enough,
+    half_width,
+    middle_depth,
+    own_depth,
+    room_to_cut,
+)
 from mushpipe.stages.cap_samples import ray_at
 
 Floats = NDArray[np.float64]
@@ -54,21 +67,24 @@ def fit_surfaces(
         (N, 2) how many points of the whole grid have depth of the cap, and how many other depth.
     """
     near = np.empty((COEFFICIENTS + 2, len(INNER)))
+    weighted = np.empty((COEFFICIENTS + 1, len(INNER)))
+    cut = room_to_cut(*image[0].shape)
     seen = np.zeros((len(discs), 2), np.int64)
     for i in rows:
-        n, middle = sample_inner(image, rank[i], discs[i], focal, noise, near)
+        n, middle = sample_inner(image, rank[i], discs[i], focal, noise, cut, near)
         size = discs[i, 2] * middle / focal
-        if n >= least and paraboloid(near[:, :n], size, out[0][i], out[1][i]):
+        if n >= least and paraboloid(near, n, size, weighted, out[0][i], out[1][i]):
             out[0][i, 0] += middle
             gate = (middle - 0.8 * size, middle + size)
             seen[i, 0], seen[i, 1] = count_seen(image, rank[i], discs[i], gate)
     return seen
 
 
-@jit
+@borrower
 def sample_inner(
-    image: Any, rank: int, disc: Floats, focal: float, noise: tuple[float, float], out: Floats
-) -> tuple[int, float]:
+    image: Any, rank: int, disc: Floats, focal: float, noise: tuple[float, float], cut: Any,
+    out: Floats,
+) -> tuple[int, float]:  # fmt: skip
     """Take block means on a grid in the inner part of a circle; arguments as `fit_surfaces`.
 
     Args:
@@ -77,15 +93,15 @@ def sample_inner(
         disc: (3,) x, y, radius, px.
         focal: Focal length, px.
         noise: Sigma of depth.
+        cut: From `room_to_cut`.
         out: (9, M) out: the seven terms of the surface, depth about the middle (m), variance.
 
     Returns:
         Number of points, and the middle depth (m), 0 without any.
     """
-    half = max(0, int(np.floor(disc[2] / GRID)))
-    means, counts = np.empty((len(CELLS), 4)), np.empty(len(CELLS))
-    average(own_depth(image[0], image[2], rank, disc, 1.0), disc, half, means, counts)
-    middle = middle_depth(means, counts, half, DISC * DISC)
+    half, blocks = half_width(disc[2], image[0].shape), cut.blocks
+    average(own_depth(image[0], image[2], rank, disc, 1.0, cut.own), disc, half, cut)
+    middle = middle_depth(cut, half, DISC * DISC)
     if middle <= 0.0:
         return 0, 0.0
     center = ray_at(image[1], focal, disc[0], disc[1])
@@ -94,12 +110,12 @@ def sample_inner(
     even = (2.5 * sigma) ** 2 + (0.6 * size * (2 * half + 1) / disc[2]) ** 2
     m = 0
     for j in INNER:
-        z = means[j, 2]
-        if counts[j] <= enough(half):
+        z, count = blocks[j + DEPTH * K], blocks[j]
+        if count <= enough(half):
             continue
-        if means[j, 3] > even or not middle - 0.8 * size < z < middle + size:
+        if blocks[j + SPREAD * K] > even or not middle - 0.8 * size < z < middle + size:
             continue
-        ray = ray_at(image[1], focal, means[j, 0], means[j, 1])
+        ray = ray_at(image[1], focal, blocks[j + U * K], blocks[j + V * K])
         if ray[2] < 1e-3:
             continue  # where the lens has none
         x = (ray[0] / ray[2] - center[0] / center[2]) * focal / disc[2]
@@ -109,14 +125,12 @@ def sample_inner(
         out[TIP, m] = np.sqrt(x * x + y * y + BLUNT * BLUNT) - BLUNT
         out[COEFFICIENTS, m] = z - middle
         # part of the noise is shared by neighbouring pixels
-        out[COEFFICIENTS + 1, m] = (
-            sigma * (0.3 + 0.7 / np.sqrt(counts[j]))
-        ) ** 2 + SHAPE_M * SHAPE_M
+        out[COEFFICIENTS + 1, m] = (sigma * (0.3 + 0.7 / np.sqrt(count))) ** 2 + SHAPE_M * SHAPE_M
         m += 1
     return m, middle
 
 
-@jit
+@borrower
 def count_seen(image: Any, rank: int, disc: Floats, gate: tuple[float, float]) -> tuple[int, int]:
     """Return on how many points of the grid depth lies within a cap's gate (m), and outside."""
     depth, _, ranks = image
@@ -131,27 +145,30 @@ def count_seen(image: Any, rank: int, disc: Floats, gate: tuple[float, float]) -
     return own, other
 
 
-@jit
-def paraboloid(points: Floats, size: float, surface: Floats, covariance: Floats) -> bool:
+@borrower
+def paraboloid(
+    points: Floats, count: int, size: float, weighted: Floats, surface: Floats, covariance: Floats
+) -> bool:
     """Fit one paraboloid by least squares with Tukey's weights; False where it is not determined.
 
     Args:
         points: (9, M) the seven terms, depth about a middle one (m) and its variance.
+        count: How many columns are points.
         size: Radius of the cap, m: the scale of what bends are expected.
+        weighted: (8, M) room.
         surface: (7,) out.
         covariance: (7, 7) out.
     """
-    count = points.shape[1]
-    weighted, right = np.empty((COEFFICIENTS, count)), np.empty(COEFFICIENTS)
+    right = weighted[COEFFICIENTS]
     for k in range(ROUNDS):
-        cut = (100.0, 25.0, 16.0)[k]
+        limit = (100.0, 25.0, 16.0)[k]
         for j in range(count):
             error = 0.0  # all count alike at first
             if k > 0:
                 error = points[COEFFICIENTS, j]
                 for i in range(COEFFICIENTS):
                     error -= surface[i] * points[i, j]
-            rest = max(1.0 - error * error / (cut * points[COEFFICIENTS + 1, j]), 0.0)
+            rest = max(1.0 - error * error / (limit * points[COEFFICIENTS + 1, j]), 0.0)
             weight = EFFECTIVE * rest * rest / points[COEFFICIENTS + 1, j]
             for i in range(COEFFICIENTS):
                 weighted[i, j] = weight * points[i, j]
@@ -171,7 +188,7 @@ def paraboloid(points: Floats, size: float, surface: Floats, covariance: Floats)
     return True
 
 
-@jit
+@borrower
 def dot(a: Floats, b: Floats, count: int) -> float:
     """Return the sum of products of the first `count` numbers."""
     total = 0.0
@@ -180,7 +197,7 @@ def dot(a: Floats, b: Floats, count: int) -> float:
     return total
 
 
-@jit
+@borrower
 def invert(matrix: Floats) -> bool:
     """Invert a positive definite matrix in place (Gauss-Jordan); False where it is none."""
     n = len(matrix)

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.jit import jit
+from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.phase_edges import Plane, Rows, Shape, Singles
 from mushpipe.stages.phase_refit import (
     COSINES,
@@ -24,7 +24,7 @@ from mushpipe.stages.phase_refit import (
     fit_outline,
     tolerance,
 )
-from mushpipe.stages.phase_strips import Strips
+from mushpipe.stages.phase_strips import Scratch, Strips, scratch_for
 from mushpipe.stages.verifier import LIMIT
 
 MARGIN = 1.0  # px; so far within an accepted circle an outline counts as hidden by it
@@ -34,7 +34,7 @@ OWN = 24  # edge points with which an outline is fitted to what is its own
 TAKEN = 2.5  # px; edges so near an accepted outline are its own
 
 
-@jit
+@borrower
 def lens(distance: float, first: float, second: float) -> float:
     """Return the area that two circles share."""
     if distance >= first + second:
@@ -51,7 +51,7 @@ def lens(distance: float, first: float, second: float) -> float:
     return sectors - triangle
 
 
-@jit
+@borrower
 def overlap_features(shape: Shape, accepted: Table, row: Table) -> None:
     """Write overlap, spans and doubled into row[4], row[5], row[6]."""
     row[4] = row[5] = row[6] = 0
@@ -66,23 +66,24 @@ def overlap_features(shape: Shape, accepted: Table, row: Table) -> None:
         row[6] = max(row[6], shared / (own + area - shared))
 
 
-@jit
-def _covered(x: Singles, y: Singles, circles: Table, margin: float) -> Rows:
-    """Return 1 for points (N,) that lie within one of the circles by more than a margin (px)."""
-    under = np.zeros(len(x), np.int32)
-    for circle in circles:
-        u, v = np.float32(circle[0]), np.float32(circle[1])
-        square = np.float32(max(0.0, circle[2] - margin) ** 2)
+@borrower
+def _covered(x: Singles, y: Singles, circles: Table, margin: float, under: Rows) -> None:
+    """Write 1 for points (N,) that lie within one of the circles by more than a margin (px)."""
+    for k in range(len(x)):
+        under[k] = 0
+    for i in range(len(circles)):
+        u, v = np.float32(circles[i, 0]), np.float32(circles[i, 1])
+        square = np.float32(max(0.0, circles[i, 2] - margin) ** 2)
         for k in range(len(x)):
             dx, dy = x[k] - u, y[k] - v
             under[k] |= dx * dx + dy * dy < square
-    return under
 
 
-@jit
+@borrower
 def outline_features(
-    edges: Strips, shape: Shape, hits: Rows, owner: Rows, accepted: Table, row: Table
-) -> None:
+    edges: Strips, shape: Shape, hits: Rows, owner: Rows, accepted: Table, row: Table,
+    scratch: Scratch,
+) -> None:  # fmt: skip
     """Write free, support, trust and hits into row[0..3].
 
     A direction is hidden where depth says so (`HIDDEN`), or where it lies within an accepted circle
@@ -91,11 +92,11 @@ def outline_features(
     n, inside, free, found, weight = 0, 0, 0, 0, 0.0
     while n < len(hits) and hits[n] != -2:
         n += 1
-    x, y = np.empty((2, n), np.float32)
+    x, y, under = scratch.lanes[0, :n], scratch.lanes[1, :n], scratch.under
     for k in range(n):
         x[k] = shape[0] + shape[2] * COSINES[n, k]
         y[k] = shape[1] + shape[2] * SINES[n, k]
-    under = _covered(x, y, accepted, MARGIN)
+    _covered(x, y, accepted, MARGIN, under)
     right, bottom = edges.width - 1, edges.height - 1
     for k in range(n):
         if x[k] < 0 or y[k] < 0 or x[k] > right or y[k] > bottom:
@@ -115,7 +116,7 @@ def outline_features(
     row[3] = math.log(1 + found)
 
 
-@jit
+@borrower
 def probability(row: Table, weights: Table) -> float:
     """Return the logistic probability of a row of features.
 
@@ -132,20 +133,20 @@ def probability(row: Table, weights: Table) -> float:
     return 1 / (1 + math.exp(-logit))
 
 
-@jit
+@borrower
 def chance_beside(
     edges: Strips, shape: Shape, hits: Rows, owner: Rows, accepted: Table, row: Table,
-    weights: Table,
+    weights: Table, scratch: Scratch,
 ) -> float:  # fmt: skip
     """Return the probability of a candidate beside the accepted; writes what depends on them."""
-    outline_features(edges, shape, hits, owner, accepted, row)
+    outline_features(edges, shape, hits, owner, accepted, row, scratch)
     overlap_features(shape, accepted, row)
     return probability(row, weights)
 
 
-@jit
-def _use_up(edges: Strips, shape: Shape, number: int, owner: Rows, scratch: Rows) -> None:
-    nothing, rows = np.zeros((0, 0), np.float32), scratch[0]
+@borrower
+def _use_up(edges: Strips, shape: Shape, number: int, owner: Rows, scratch: Scratch) -> None:
+    rows, nothing = scratch.rows, scratch.lanes[:0]
     count = around(edges, nothing, 0.0, shape, NARROW, scratch)
     near = max(TAKEN, 1.3 * tolerance(shape[2]))
     for k in range(count):
@@ -181,12 +182,12 @@ def decide(
     n = len(shapes)
     owner = np.full(len(edges.x), -1, np.int32)
     chance, waiting = np.empty(n), np.ones(n, np.bool_)
-    order, scratch = np.empty(n, np.int32), np.empty((2, len(edges.x)), np.int32)
+    order, scratch = np.empty(n, np.int32), scratch_for(len(edges.x))
     first, beside = neighbours(shapes)
     near = np.empty((n, 5))
     for k in range(n):
         chance[k] = chance_beside(
-            edges, shapes[k], hits[k], owner, near[:0], table[k], weights[model[k]]
+            edges, shapes[k], hits[k], owner, near[:0], table[k], weights[model[k]], scratch
         )
     for count in range(n):
         best, top = -1, least
@@ -202,8 +203,9 @@ def decide(
             if waiting[k] and chance[k] > HOPELESS:
                 met = _accepted(shapes, waiting, beside[first[k] : first[k + 1]], near)
                 chance[k] = chance_beside(
-                    edges, shapes[k], hits[k], owner, near[:met], table[k], weights[model[k]]
-                )
+                    edges, shapes[k], hits[k], owner, near[:met], table[k], weights[model[k]],
+                    scratch,
+                )  # fmt: skip
     return order, chance, owner
 
 
@@ -243,28 +245,59 @@ def neighbours(shapes: Table) -> tuple[Rows, Rows]:
     return first, beside
 
 
-@jit
+@borrower
 def _accepted(shapes: Table, waiting: NDArray[np.bool_], beside: Rows, near: Table) -> int:
     """Write the accepted of some outlines to the first rows of `near`; return how many."""
     count = 0
     for k in beside:
         if not waiting[k]:
-            near[count] = shapes[k]
+            for i in range(shapes.shape[1]):
+                near[count, i] = shapes[k, i]
             count += 1
     return count
 
 
-@jit
-def _met(shape: Shape, accepted: Table) -> Table:
-    """Return the accepted outlines whose circle meets the circle of a shape."""
-    found = np.empty_like(accepted)
+@borrower
+def _met(shape: Shape, accepted: Table, found: Table) -> int:
+    """Write the accepted outlines whose circle meets the circle of a shape; return how many."""
     count = 0
-    for other in accepted:
-        reach = other[2] + shape[2]
-        if (other[0] - shape[0]) ** 2 + (other[1] - shape[1]) ** 2 < reach * reach:
-            found[count] = other
+    for k in range(len(accepted)):
+        across, down = accepted[k, 0] - shape[0], accepted[k, 1] - shape[1]
+        reach = accepted[k, 2] + shape[2]
+        if across**2 + down**2 < reach * reach:
+            for i in range(accepted.shape[1]):
+                found[count, i] = accepted[k, i]
             count += 1
-    return found[:count]
+    return count
+
+
+@borrower
+def _keep_own(
+    edges: Strips, k: int, count: int, near: Table, owner: Rows, x: Singles, y: Singles,
+    scratch: Scratch,
+) -> int:  # fmt: skip
+    """Keep of the first `scratch.rows` those that are an outline's own; return how many.
+
+    Args:
+        edges: Edge points.
+        k: Number of the outline.
+        count: How many rows.
+        near: (N, 5) accepted outlines that meet it.
+        owner: Of every edge point.
+        x: Room for as many.
+        y: Likewise.
+        scratch: In and out.
+    """
+    own, shaded, kept = scratch.rows, scratch.near, 0
+    for m in range(count):
+        x[m], y[m] = edges.x[own[m]], edges.y[own[m]]
+    _covered(x[:count], y[:count], near, -SHADE, shaded)
+    for m in range(count):
+        row = own[m]
+        if (owner[row] < 0 or owner[row] == k) and shaded[m] == 0:
+            own[kept] = row
+            kept += 1
+    return kept
 
 
 @jit
@@ -274,21 +307,14 @@ def polish(edges: Strips, height: Plane, pixel: float, outlines: Table, owner: R
     Edges of others do not count, nor those within or just outside a circle that was accepted
     before: where a cap dips under another one, its steepest shading is not its outline.
     """
-    scratch = np.empty((2, len(edges.x)), np.int32)
-    own = scratch[0]
-    shape = np.empty(5)
+    scratch, places = scratch_for(len(edges.x)), np.empty((2, len(edges.x)), np.float32)
+    shape, near = np.empty(5), np.empty_like(outlines)
     for k in range(len(outlines)):
         shape[:] = outlines[k]
-        near = _met(shape, outlines[:k])
+        met = _met(shape, outlines[:k], near)
         count = around(edges, height, pixel, shape, NARROW, scratch)
-        shaded = _covered(edges.x[own[:count]], edges.y[own[:count]], near, -SHADE)
-        kept = 0
-        for m in range(count):
-            row = own[m]
-            if (owner[row] < 0 or owner[row] == k) and shaded[m] == 0:
-                own[kept] = row
-                kept += 1
-        moved = fit_outline(edges, own, kept, shape, NARROW) if kept >= OWN else False
+        kept = _keep_own(edges, k, count, near[:met], owner, places[0], places[1], scratch)
+        moved = fit_outline(edges, kept, shape, NARROW, scratch) if kept >= OWN else False
         limit = max(1.5, 0.15 * outlines[k, 2])
         away = math.hypot(shape[0] - outlines[k, 0], shape[1] - outlines[k, 1])
         if moved and abs(shape[2] - outlines[k, 2]) < limit and away < limit:

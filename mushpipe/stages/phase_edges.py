@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.jit import jit
+from mushpipe.core.jit import borrower, jit
 
 Plane = NDArray[np.float32]
 Singles = NDArray[np.float32]
@@ -123,7 +123,7 @@ def otsu_of(size: Plane, top: float) -> float:
     return float((threshold + 1) / scale)
 
 
-@jit
+@borrower
 def _at(plane: Plane, x: float, y: float) -> float:
     """Bilinear value; the point lies within the image."""
     u, v = int(x), int(y)
@@ -133,7 +133,7 @@ def _at(plane: Plane, x: float, y: float) -> float:
     return float(top + fy * (bottom - top))
 
 
-@jit
+@borrower
 def _looked_up(
     image: Plane, x: Singles, y: Singles, nx: Singles, ny: Singles, t: float, out: Singles
 ) -> None:
@@ -159,7 +159,7 @@ def _beyond_over_before(image: Plane, x: Singles, y: Singles, nx: Singles, ny: S
     return near
 
 
-@jit
+@borrower
 def _ridge(
     above: Singles, here: Singles, below: Singles, gx: Singles, gy: Singles,
     region: NDArray[np.uint8], threshold: float, maybe: NDArray[np.uint8],

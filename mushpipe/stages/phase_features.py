@@ -11,13 +11,16 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.jit import jit
+from mushpipe.core.jit import borrower
 from mushpipe.stages.linear import solve
 from mushpipe.stages.phase_edges import Gradient, Plane, Rows, Shape
 from mushpipe.stages.phase_refit import COSINES, HIDDEN, SINES, Table
 from mushpipe.stages.phase_steps import height_at, rises, step_up
+from mushpipe.stages.phase_strips import DIRECTIONS
 
 Bytes = NDArray[np.uint8]
+# heights and weights (P,), normal matrix (6, 6) and its right side, and (2, DIRECTIONS)
+Room = tuple[Table, Table, Table, Table, Plane]
 
 # How bright a cap is against what is beside it is none of them: simulated beds are fuller than real
 # ones, so a cap with dark soil all around it counted as less likely than one in a cluster.
@@ -70,7 +73,7 @@ def kinds(table: Table, middle: Table) -> Rows:
     return known.astype(np.int32) + low
 
 
-@jit
+@borrower
 def _pixel(x: float, y: float, width: int, height: int) -> tuple[int, int]:
     """Nearest pixel; x = -1 beyond the image."""
     u, v = math.floor(x + 0.5), math.floor(y + 0.5)
@@ -79,7 +82,7 @@ def _pixel(x: float, y: float, width: int, height: int) -> tuple[int, int]:
     return u, v
 
 
-@jit
+@borrower
 def disc_features(
     image: Plane, gx: Plane, gy: Plane, size: Plane, mask: Bytes, shape: Shape, rings: Table,
     row: Table,
@@ -109,7 +112,7 @@ def disc_features(
     row[2] = min(4.0, small * shape[2] / max(bright, 1e-9 + 4 * small_area))
 
 
-@jit
+@borrower
 def _quadric(z: Table, sigma: float, before: Table, a: Table, weight: Table) -> float:
     """Fit z = b0 + b1 u + b2 v + b3 u^2 + b4 u v + b5 v^2 to heights z (P,) m, -1 for unknown.
 
@@ -147,7 +150,7 @@ def _quadric(z: Table, sigma: float, before: Table, a: Table, weight: Table) -> 
     return math.sqrt(squares / max(count, 1.0))
 
 
-@jit
+@borrower
 def _misfit(z: float, k: int, b: Table) -> float:
     """Return how far (m) the height of the k-th point lies from a quadric."""
     plane = b[0] + b[1] * _BY_TERM[1, k] + b[2] * _BY_TERM[2, k]
@@ -155,8 +158,8 @@ def _misfit(z: float, k: int, b: Table) -> float:
     return float(abs(z - plane - bend))
 
 
-@jit
-def surface_features(height: Plane, shape: Shape, pixel: float, row: Table) -> float:
+@borrower
+def surface_features(height: Plane, shape: Shape, pixel: float, row: Table, room: Room) -> float:
     """Write height, bend_small, bend_large, roughness and gap into row[0..3] and row[6].
 
     Args:
@@ -164,11 +167,12 @@ def surface_features(height: Plane, shape: Shape, pixel: float, row: Table) -> f
         shape: x, y, r, p, q.
         pixel: Size of a pixel on the bed, m.
         row: Receives the features.
+        room: To work in.
 
     Returns:
         The height of the middle, m; NaN where too little is known.
     """
-    z, known = np.empty(len(_BASIS)), 0
+    (z, weight, a, b, _), known = room, 0
     for k in range(len(z)):
         x, y = shape[0] + _BASIS[k, 1] * shape[2], shape[1] + _BASIS[k, 2] * shape[2]
         z[k] = height_at(height, x, y)
@@ -176,7 +180,7 @@ def surface_features(height: Plane, shape: Shape, pixel: float, row: Table) -> f
     row[6] = 1 - known / len(z)
     if row[6] > 1 - LEAST_KNOWN or known < 8:
         return math.nan
-    a, b, weight = np.empty((6, 6)), np.zeros(6), np.empty(len(z))
+    b[:] = 0.0
     rms = _quadric(z, math.inf, b, a, weight)
     rms = _quadric(z, max(0.001, rms), b, a, weight)
     radius = shape[2] * pixel
@@ -188,14 +192,16 @@ def surface_features(height: Plane, shape: Shape, pixel: float, row: Table) -> f
     return float(b[0])
 
 
-@jit
-def edge_features(height: Plane, shape: Shape, pixel: float, hits: Rows, row: Table) -> None:
+@borrower
+def edge_features(
+    height: Plane, shape: Shape, pixel: float, hits: Rows, row: Table, lanes: Plane
+) -> None:
     """Write drop and rise into row[4], row[5]; mark directions of `hits` with a rise as hidden."""
     step = step_up(shape[2] * pixel)
     n, known, lower, higher = 0, 0, 0, 0
     while n < len(hits) and hits[n] != -2:
         n += 1
-    ups = np.empty((2, n), np.float32)
+    ups = lanes[:, :n]
     rises(height, shape, COSINES[n, :n], SINES[n, :n], ups)
     for k in range(n):
         up = ups[0, k]
@@ -211,11 +217,11 @@ def edge_features(height: Plane, shape: Shape, pixel: float, hits: Rows, row: Ta
     row[5] = higher / max(known, 1)
 
 
-@jit
+@borrower
 def _static(
     image: Plane, gx: Plane, gy: Plane, size: Plane, mask: Bytes, height: Plane, pixel: float,
     shapes: Table, hits: Rows, residual: Plane, rings: Table, table: Table, middle: Table,
-    places: tuple[int, int],
+    places: tuple[int, int], room: Room,
 ) -> None:  # fmt: skip
     first, depth = places
     for k in range(len(shapes)):
@@ -225,9 +231,9 @@ def _static(
         disc_features(image, gx, gy, size, mask, shape, rings, row[first + 2 :])
         middle[k] = math.nan
         if len(height):
-            middle[k] = surface_features(height, shape, pixel, row[depth:])
+            middle[k] = surface_features(height, shape, pixel, row[depth:], room)
             if middle[k] == middle[k]:
-                edge_features(height, shape, pixel, hits[k], row[depth:])
+                edge_features(height, shape, pixel, hits[k], row[depth:], room[4])
 
 
 def static_features(
@@ -250,7 +256,10 @@ def static_features(
     """
     table, middle = np.zeros((len(shapes), len(NAMES))), np.full(len(shapes), np.nan)
     places = (FIRST_STATIC, FIRST_DEPTH)
+    room = (np.empty(len(_BASIS)), np.empty(len(_BASIS)), np.empty((6, 6)), np.empty(6))
+    lanes = np.empty((2, DIRECTIONS), np.float32)
     _static(
-        image, *grad, mask, height, pixel, shapes, hits, residual, _RINGS, table, middle, places
-    )
+        image, *grad, mask, height, pixel, shapes, hits, residual, _RINGS, table, middle, places,
+        (*room, lanes),
+    )  # fmt: skip
     return table, middle

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe import Circles
-from mushpipe.core.jit import jit
+from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.phase_decide import lens
 from mushpipe.stages.phase_edges import Plane
 from mushpipe.stages.phase_refit import Table
@@ -38,7 +38,7 @@ def agreement(shapes: Table, radius: Table, learned: Circles) -> Table:
     return _agreement(shapes, radius, learned.center, learned.radius, learned.score)
 
 
-@jit
+@borrower
 def _fill(foreground: NDArray[np.uint8], center: Table, radius: Table) -> None:
     height, width = foreground.shape
     for k in range(len(center)):

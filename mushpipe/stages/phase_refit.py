@@ -13,14 +13,21 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.jit import jit
+from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.linear import solve
 from mushpipe.stages.phase_edges import Plane, Rows, Shape, Singles
 from mushpipe.stages.phase_steps import step_up
-from mushpipe.stages.phase_strips import TURNED, Strips, gather, outline_hits
+from mushpipe.stages.phase_strips import (
+    DIRECTIONS,
+    TURNED,
+    Scratch,
+    Strips,
+    gather,
+    outline_hits,
+    scratch_for,
+)
 
 Table = NDArray[np.float64]
-DIRECTIONS = 96
 # Cosine and sine of each direction, by how many directions there are.
 _TURNS = 2 * np.pi * np.arange(DIRECTIONS) / np.maximum(np.arange(DIRECTIONS + 1), 1)[:, None]
 COSINES, SINES = np.cos(_TURNS).astype(np.float32), np.sin(_TURNS).astype(np.float32)
@@ -39,19 +46,19 @@ FIRM = 0.9  # share of the outline with edges, from which on no second start is 
 HIDDEN = -3  # in a table of hits: something nearer hides the outline there
 
 
-@jit
+@borrower
 def directions_of(radius: float) -> int:
     """Return how many directions an outline is looked at in: one every 2 px."""
     return min(DIRECTIONS, max(24, int(math.pi * radius)))
 
 
-@jit
+@borrower
 def tolerance(radius: float) -> float:
     """Return how far (px) from the outline an edge point still supports it."""
     return max(1.5, 0.07 * radius)
 
 
-@jit
+@borrower
 def _accumulate(
     edges: Strips, rows: Rows, count: int, shape: Shape, scale: float, a: Table, b: Table
 ) -> float:
@@ -92,11 +99,14 @@ def _accumulate(
     return float(total)
 
 
-@jit
-def fit_outline(edges: Strips, rows: Rows, count: int, shape: Shape, stage: int) -> bool:
-    """Improve x, y, r, p, q (5,) in place; False where the points do not hold it in place."""
+@borrower
+def fit_outline(edges: Strips, count: int, shape: Shape, stage: int, scratch: Scratch) -> bool:
+    """Improve x, y, r, p, q (5,) in place by the first points of `scratch.rows`.
+
+    False where they do not hold it in place.
+    """
     start_x, start_y, start_r = shape[0], shape[1], shape[2]
-    a, b = np.empty((5, 5)), np.empty(5)
+    rows, a, b = scratch.rows, scratch.a, scratch.b
     for scale_of_radius in SCALES[stage]:
         scale = max(1.0, scale_of_radius * shape[2])
         if _accumulate(edges, rows, count, shape, scale, a, b) < LEAST:
@@ -118,23 +128,23 @@ def fit_outline(edges: Strips, rows: Rows, count: int, shape: Shape, stage: int)
     return True
 
 
-@jit
+@borrower
 def around(
-    edges: Strips, height: Plane, pixel: float, shape: Shape, stage: int, scratch: Rows
+    edges: Strips, height: Plane, pixel: float, shape: Shape, stage: int, scratch: Scratch
 ) -> int:
-    """Write the rows of edge points around an outline into `scratch[0]`; return how many."""
+    """Write the rows of edge points around an outline into `scratch.rows`; return how many."""
     reach = max(3.0, REACH[stage] * shape[2])
     relief = height if stage == NARROW else height[:0]
     return gather(edges, relief, step_up(shape[2] * pixel), shape, reach, scratch)
 
 
-@jit
+@borrower
 def fit_around(
-    edges: Strips, height: Plane, pixel: float, shape: Shape, stage: int, scratch: Rows
+    edges: Strips, height: Plane, pixel: float, shape: Shape, stage: int, scratch: Scratch
 ) -> bool:
     """Fit an outline (5,) to the edge points around it, in place; False if they do not hold it."""
     count = around(edges, height, pixel, shape, stage, scratch)
-    return count >= 2 * LEAST and fit_outline(edges, scratch[0], count, shape, stage)
+    return count >= 2 * LEAST and fit_outline(edges, count, shape, stage, scratch)
 
 
 @jit
@@ -158,7 +168,7 @@ def refit(
     n = len(candidates) * len(STARTS)
     shapes, residual = np.empty((n, 5)), np.empty(n, np.float32)
     hits = np.full((n, DIRECTIONS), -2, np.int32)
-    scratch = np.empty((2, len(edges.x)), np.int32)
+    scratch = scratch_for(len(edges.x))
     kept = tried = 0
     firm = np.zeros(len(candidates), np.bool_)
     wide, following = np.empty((n, 5)), np.empty((2, n), np.int32)
@@ -192,21 +202,21 @@ def refit(
     return shapes[:kept], hits[:kept], residual[:kept]
 
 
-@jit
+@borrower
 def _cell(shape: Shape, cells: Rows) -> tuple[int, int]:
     """Return row and column of an outline's centre in a grid; places beyond it count as its rim."""
     row = min(max(int(shape[1] / BUCKET), 1), cells.shape[0] - 2)
     return row, min(max(int(shape[0] / BUCKET), 1), cells.shape[1] - 2)
 
 
-@jit
+@borrower
 def _enter(shape: Shape, number: int, cells: Rows, following: Rows) -> None:
     """Enter an outline in the grid; arguments as `_known`."""
     row, column = _cell(shape, cells)
     following[number], cells[row, column] = cells[row, column], number
 
 
-@jit
+@borrower
 def _known(shape: Shape, others: Table, cells: Rows, following: Rows) -> bool:
     """Whether another outline is the same but for a few per cent.
 

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from mushpipe.core.jit import jit
+from mushpipe.core.jit import borrower
 from mushpipe.stages.phase_edges import Plane, Shape, Singles
 
 STEP_UP = 0.004  # m
 
 
-@jit
+@borrower
 def step_up(radius: float) -> float:
     """Return the difference of heights (m) that counts as a step at a cap of a radius (m)."""
     return max(STEP_UP, 0.15 * radius)
 
 
-@jit
+@borrower
 def height_at(height: Plane, x: float, y: float) -> float:
     """Return the height (m) at an image point; -1 where it is unknown."""
     u, v = int((x + 0.5) * 0.5), int((y + 0.5) * 0.5)
@@ -26,7 +26,7 @@ def height_at(height: Plane, x: float, y: float) -> float:
     return float(value) if inside else -1.0
 
 
-@jit
+@borrower
 def _raise(
     plane: Plane, x: float, y: float, c: Singles, s: Singles, t: float, out: Singles
 ) -> None:
@@ -42,7 +42,7 @@ def _raise(
         out[k] = max(out[k], z if inside else nothing)
 
 
-@jit
+@borrower
 def rises(height: Plane, shape: Shape, c: Singles, s: Singles, scratch: Plane) -> None:
     """Write by how much (m) the highest point just outside an outline lies over its inside.
 

@@ -10,13 +10,15 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mushpipe.core.jit import inlined, jit
+from mushpipe.core.jit import borrower, inlined, jit
 from mushpipe.stages.phase_edges import Edges, Plane, Rows, Shape, Singles
 from mushpipe.stages.phase_steps import rises
 
 Single = np.float32
 STRIP = 16  # px
+DIRECTIONS = 96  # in which an outline is looked at, at most
 AROUND = 32  # sectors of an outline in which it is looked for what hides it
 # They are as wide as each other in |cos| + |sin| = 1, where a point's sector needs no arc tangent.
 _SIDE = np.repeat([1, -1], AROUND // 2)
@@ -55,6 +57,36 @@ class Strips(NamedTuple):
     width: int
 
 
+class Scratch(NamedTuple):
+    """Room to work in, made once for all outlines.
+
+    Attributes:
+        rows: (M,) of edge points, M their number.
+        near: (M,) what is known of them.
+        off: (DIRECTIONS,) distances of hits, in 1/1000 px.
+        under: (DIRECTIONS,) whether accepted outlines cover a direction.
+        lanes: (2, DIRECTIONS) of whatever has a number per direction.
+        a: (5, 5) normal matrix.
+        b: (5,) its right side.
+    """
+
+    rows: Rows
+    near: Rows
+    off: Rows
+    under: Rows
+    lanes: Plane
+    a: NDArray[np.float64]
+    b: NDArray[np.float64]
+
+
+@jit
+def scratch_for(count: int) -> Scratch:
+    """Return room to work in with so many edge points."""
+    rows, lanes = np.empty((2, count), np.int32), np.empty((2, DIRECTIONS), np.int32)
+    planes = np.empty((2, DIRECTIONS), np.float32)
+    return Scratch(rows[0], rows[1], lanes[0], lanes[1], planes, np.empty((5, 5)), np.empty(5))
+
+
 @jit
 def _sort(points: Plane, height: int, width: int) -> tuple[Plane, Rows]:
     """Return points (C, M), x and y first, by strip and column, and where each column begins."""
@@ -83,7 +115,7 @@ def in_strips(edges: Edges, height: int, width: int) -> Strips:
     return Strips(x, y, nx, ny, weight, starts, height, width)
 
 
-@jit
+@borrower
 def _sector(dx: float, dy: float) -> int:
     """Return the sector of a direction."""
     across = dx / (abs(dx) + abs(dy))
@@ -91,14 +123,17 @@ def _sector(dx: float, dy: float) -> int:
     return int(turn * (AROUND / 4)) % AROUND
 
 
-@jit
+@borrower
 def _uncovered(
-    edges: Strips, height: Plane, step: float, shape: Shape, rows: Rows, count: int
+    edges: Strips, height: Plane, step: float, shape: Shape, count: int, scratch: Scratch
 ) -> int:
     """Keep the rows of points in whose sector nothing stands higher; return their number."""
-    up, kept = np.empty((2, AROUND), np.float32), 0
+    rows, up, kept = scratch.rows, scratch.lanes[:, :AROUND], 0
     rises(height, shape, COSINE, SINE, up)
-    if up[0].max() <= step:
+    highest = np.float32(0)
+    for k in range(AROUND):
+        highest = max(highest, up[0, k])
+    if highest <= step:
         return count
     for k in range(count):
         row = rows[k]
@@ -107,7 +142,7 @@ def _uncovered(
     return kept
 
 
-@jit
+@borrower
 def _strips(edges: Strips, shape: Shape, outer: float) -> tuple[int, int]:
     """Return the strips, from and up to, that a circle around an outline's centre crosses.
 
@@ -118,7 +153,7 @@ def _strips(edges: Strips, shape: Shape, outer: float) -> tuple[int, int]:
     return first // STRIP, last // STRIP + 1
 
 
-@jit
+@borrower
 def _span(edges: Strips, shape: Shape, outer: float, strip: int) -> tuple[int, int]:
     """Return the rows, from and up to, of the points of a strip that may lie in such a circle."""
     above = strip * STRIP - shape[1] if strip > 0 else 0.0
@@ -131,7 +166,7 @@ def _span(edges: Strips, shape: Shape, outer: float, strip: int) -> tuple[int, i
     return edges.starts[row + left], edges.starts[row + right + 1]
 
 
-@jit
+@borrower
 def _single(shape: Shape) -> tuple[Single, Single, Single, Single, Single]:
     """Return an outline in single precision, in which SIMD does twice as much."""
     x, y, r = np.float32(shape[0]), np.float32(shape[1]), np.float32(shape[2])
@@ -159,7 +194,7 @@ def _seen(
     return dx, dy, e, (away < 0) & (away * away >= square * squared) & (squared >= one)
 
 
-@jit
+@borrower
 def _around(edges: Strips, low: int, shape: Shape, reach: float, near: Rows) -> None:
     """Write if the points from a row on lie within `reach` of an outline and face its centre."""
     outline, square, far = _single(shape), np.float32(TURNED**2), np.float32(reach)
@@ -168,11 +203,11 @@ def _around(edges: Strips, low: int, shape: Shape, reach: float, near: Rows) -> 
         near[i] = facing & (e <= far)
 
 
-@jit
+@borrower
 def gather(
-    edges: Strips, height: Plane, step: float, shape: Shape, reach: float, scratch: Rows
+    edges: Strips, height: Plane, step: float, shape: Shape, reach: float, scratch: Scratch
 ) -> int:
-    """Write which edge points around an outline face its centre into `scratch[0]`; return how many.
+    """Write which edge points around an outline face its centre to `scratch.rows`; return how many.
 
     None where it is higher outside by `step` (m), for there something nearer hides the outline.
 
@@ -182,22 +217,22 @@ def gather(
         step: m
         shape: (5,) the outline.
         reach: How far (px) from it points are looked for.
-        scratch: (2, M), M the number of all edge points.
+        scratch: For all edge points.
     """
-    rows, count = scratch[0], 0
+    rows, count = scratch.rows, 0
     outer = shape[2] + abs(shape[3]) + abs(shape[4]) + reach
     first, last = _strips(edges, shape, outer)
     for strip in range(first, last):
         low, high = _span(edges, shape, outer, strip)
-        near = scratch[1, : high - low]
+        near = scratch.near[: high - low]
         _around(edges, low, shape, reach, near)
         for i in range(high - low):
             rows[count] = low + i
             count += near[i]
-    return _uncovered(edges, height, step, shape, rows, count) if len(height) else count
+    return _uncovered(edges, height, step, shape, count, scratch) if len(height) else count
 
 
-@jit
+@borrower
 def _turn(dx: Single, dy: Single) -> Single:
     """Return the angle (0..2 pi) of a direction, to 1e-5.
 
@@ -212,7 +247,7 @@ def _turn(dx: Single, dy: Single) -> Single:
     return FULL - angle if dy < 0 else angle
 
 
-@jit
+@borrower
 def _beside(
     edges: Strips, low: int, shape: Shape, near: float, n: int, at: Rows, off: Rows
 ) -> None:
@@ -239,9 +274,9 @@ def _beside(
         off[i] = np.int32(e * fine)
 
 
-@jit
+@borrower
 def outline_hits(
-    edges: Strips, shape: Shape, near: float, n: int, hits: Rows, scratch: Rows
+    edges: Strips, shape: Shape, near: float, n: int, hits: Rows, scratch: Scratch
 ) -> tuple[int, float]:
     """Write per direction the row of the nearest edge point that supports the outline, else -1.
 
@@ -251,18 +286,18 @@ def outline_hits(
         near: How far (px) from the outline a point may lie.
         n: Number of directions.
         hits: (D,) receives the rows, and -2 beyond the last direction.
-        scratch: (2, M)
+        scratch: For all edge points.
 
     Returns:
         The number of hits, and the root mean square of their distances (px).
     """
-    best = np.full(n, 2**30, np.int32)
-    hits[:n], hits[n:] = -1, -2
+    best = scratch.off
+    best[:n], hits[:n], hits[n:] = 2**30, -1, -2
     outer = shape[2] + abs(shape[3]) + abs(shape[4]) + near
     first, last = _strips(edges, shape, outer)
     for strip in range(first, last):
         low, high = _span(edges, shape, outer, strip)
-        at, off = scratch[0, : high - low], scratch[1, : high - low]
+        at, off = scratch.rows[: high - low], scratch.near[: high - low]
         _beside(edges, low, shape, near, n, at, off)
         for i in range(high - low):
             direction = at[i] % n

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.jit import jit
+from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.phase_edges import Plane, Singles
 from mushpipe.stages.phase_strips import Strips
 
@@ -101,7 +101,7 @@ def summed(cells: NDArray[np.float32]) -> tuple[NDArray[np.float32], Plane]:
     return total, size
 
 
-@jit
+@borrower
 def _highest_around(size: Plane, x: int, y: int, reach: int) -> bool:
     value = size[y, x]
     for v in range(max(y - reach, 0), min(y + reach + 1, size.shape[0])):
@@ -112,7 +112,7 @@ def _highest_around(size: Plane, x: int, y: int, reach: int) -> bool:
     return True
 
 
-@jit
+@borrower
 def _vertex(before: float, at: float, behind: float) -> float:
     bend = before - 2 * at + behind
     if bend > -1e-9:

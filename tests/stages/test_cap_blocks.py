@@ -7,10 +7,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mushpipe.stages.cap_blocks import CELLS, HIDDEN, average, own_depth
+from mushpipe.stages.cap_blocks import (
+    CELLS,
+    COUNT,
+    DEPTH,
+    HIDDEN,
+    SPREAD,
+    K,
+    U,
+    V,
+    average,
+    median,
+    own_depth,
+    room_to_cut,
+)
 from mushpipe.stages.cap_samples import COMPASS, DIRECTIONS, INNER, RADII, STEP, follow
 
-Cut = tuple[np.ndarray, int, int]
 WIDTH, HEIGHT = 64, 48
 PLACES = st.tuples(st.floats(-10, 74), st.floats(-10, 58), st.floats(4, 30))
 
@@ -39,9 +51,9 @@ def test_blocks_are_the_means_of_their_valid_pixels(
     seed: int, place: tuple[float, float, float], half: int
 ) -> None:
     depth, ranks = scene(seed)
-    circle = np.array(place)
-    means, counts = np.empty((len(CELLS), 4)), np.empty(len(CELLS))
-    average(own_depth(depth, ranks, 1, circle, 1.45), circle, half, means, counts)
+    circle, cut = np.array(place), room_to_cut(HEIGHT, WIDTH)
+    average(own_depth(depth, ranks, 1, circle, 1.45, cut.own), circle, half, cut)
+    blocks = cut.blocks.reshape(-1, K)
     for cell, (x, y) in enumerate(CELLS):
         u0, v0 = np.floor(circle[:2] + circle[2] * np.array([x, y]) + 0.5).astype(int)
         seen = [
@@ -50,10 +62,11 @@ def test_blocks_are_the_means_of_their_valid_pixels(
             for u in range(u0 - half, u0 + half + 1)
         ]
         valid = np.array([p for p in seen if p[2] > 0]).reshape(-1, 3)
-        assert counts[cell] == len(valid)
+        assert blocks[COUNT, cell] == len(valid)
         if len(valid):
-            assert means[cell, :3] == pytest.approx(valid.mean(axis=0), rel=1e-6, abs=1e-5)
-            assert means[cell, 3] == pytest.approx(valid[:, 2].var(), abs=1e-6)
+            found = blocks[[U, V, DEPTH], cell]
+            assert found == pytest.approx(valid.mean(axis=0), rel=1e-6, abs=1e-5)
+            assert blocks[SPREAD, cell] == pytest.approx(valid[:, 2].var(), abs=1e-6)
 
 
 def followed(
@@ -91,11 +104,10 @@ def test_edges_are_those_that_single_steps_find(
     depth, ranks = scene(seed)
     # places between pixels: single precision does not decide which
     circle = np.round(np.array(place), 1) + 0.037
-    cut = own_depth(depth, ranks, 1, circle, 1.45)
-    if not cut[0].size:
-        return
-    state = np.empty(6 * DIRECTIONS, np.float32)
-    follow(cut, circle, (low, high), state)
+    own = np.empty(depth.size, np.float32)
+    window = own_depth(depth, ranks, 1, circle, 1.45, own)
+    state, pixels = np.empty(6 * DIRECTIONS, np.float32), np.empty(DIRECTIONS, np.int32)
+    follow(window, own, circle, (low, high), state, pixels)
     rows = state.reshape(6, DIRECTIONS)
     found = np.where(rows[4] > 0, rows[3], -1)
     expected = [followed(depth, ranks, circle, j, (low, high)) for j in range(DIRECTIONS)]
@@ -105,8 +117,16 @@ def test_edges_are_those_that_single_steps_find(
 
 def test_a_circle_beyond_the_image_has_no_depth() -> None:
     depth, ranks = scene(0)
-    circle, counts = np.array([-500.0, 900.0, 20.0]), np.ones(len(CELLS))
-    cut = own_depth(depth, ranks, 1, circle, 1.45)
-    average(cut, circle, 1, np.empty((len(CELLS), 4)), counts)
-    assert cut[0].size == 0
-    assert not counts.any()
+    circle, cut = np.array([-500.0, 900.0, 20.0]), room_to_cut(HEIGHT, WIDTH)
+    window = own_depth(depth, ranks, 1, circle, 1.45, cut.own)
+    average(window, circle, 1, cut)
+    assert window.width * window.height == 0
+    assert not cut.blocks[:K].any()
+
+
+@settings(deadline=None)
+@given(st.lists(st.floats(0.125, 5, width=32), max_size=K))
+def test_the_median_is_that_of_numpy(values: list[float]) -> None:
+    room = np.array(values, np.float32)
+    expected = np.median(room) if values else 0.0
+    assert median(room, len(room)) == pytest.approx(expected, rel=1e-6)

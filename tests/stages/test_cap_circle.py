@@ -11,9 +11,12 @@ from mushpipe import Camera, Circles
 from mushpipe.stages.cap_circle import circle_around, improve
 from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.cap_model import SIZE, span
-from mushpipe.stages.cap_samples import COMPASS
+from mushpipe.stages.cap_outline import LANES_ROOM
+from mushpipe.stages.cap_samples import COMPASS, DIRECTIONS
 from mushpipe.stages.upright import pixel_rays
 from tests.stages.caps import CAMERA, Cap, cap, circle_of, circles_of, draw, frame_from
+
+ROOM = (np.empty(LANES_ROOM, np.float32), np.empty(2 * DIRECTIONS, np.int32))
 
 
 @settings(max_examples=50, deadline=None)
@@ -32,9 +35,8 @@ def test_an_ellipse_seen_from_beside_its_centre(
     d, o = COMPASS @ to_unit.T, to_unit @ seen_from
     dd, do = (d**2).sum(axis=1), d @ o
     reach = (-do + np.sqrt(do**2 - dd * (o @ o - 1))) / dd
-    found = np.empty(3)
-    circle_around(np.array([*seen_from, a]), reach, found)
-    assert found[:2] == pytest.approx([0, 0], abs=2e-3 * a)
+    found = circle_around(np.array([*seen_from, a]), reach)
+    assert found[:2] == pytest.approx((0, 0), abs=2e-3 * a)
     assert found[2] == pytest.approx(np.sqrt(a * b), rel=1e-3)
 
 
@@ -56,7 +58,7 @@ def test_a_cap_that_the_image_does_not_show_has_the_circle_of_its_outline(
     true = cap(tilt, 70, place, 0.022, 0.7)
     outline = np.array(circle_of(true, camera))
     circle = outline + np.array([2.0, -1.5, 3.0])
-    improve(circle, parameters(true), (16.0, 0.0), 1.0, pixel_rays(camera), camera.fx)
+    improve(circle, parameters(true), (16.0, 0.0), 1.0, pixel_rays(camera), camera.fx, ROOM)
     assert np.abs(circle - outline).max() < 0.2
 
 
@@ -92,7 +94,7 @@ def test_a_cap_that_nothing_holds_does_not_move_its_circle() -> None:
     detected = np.array(circle_of(true)) + np.array([3.0, 0.0, 0.0])
     for held, doubt in (((16.0, 0.0), 1.0), ((16.0, 0.0), 3.0), ((4.0, 0.0), 1.0)):
         circle = detected.copy()
-        improve(circle, parameters(true), held, doubt, pixel_rays(CAMERA), CAMERA.fx)
+        improve(circle, parameters(true), held, doubt, pixel_rays(CAMERA), CAMERA.fx, ROOM)
         moved.append(float(np.linalg.norm(circle[:2] - detected[:2])))
     assert moved[0] == pytest.approx(3.0, abs=0.15)
     assert moved[1] < 1.1

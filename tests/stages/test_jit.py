@@ -5,11 +5,16 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from numba.core.errors import NumbaError
+from numba.core.runtime import _nrt_python as _nrt
+from numba.core.runtime import rtsys
 
 import mushpipe
-from mushpipe import Stage
+from mushpipe import Mask, Stage
 from mushpipe.core import jit as jitting
+from mushpipe.sources.synthetic import SyntheticSource
 from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.depth_correct import DepthCorrect
 from mushpipe.stages.fuse_depth import FuseDepth
@@ -120,3 +125,30 @@ def test_defaults_are_floats_where_settings_are(stage: type[Stage]) -> None:
         numbers = field.default if isinstance(field.default, tuple) else (field.default,)
         if "float" in str(field.annotation):
             assert not any(type(number) is int for number in numbers), name
+
+
+def test_kernels_that_count_no_references_leave_none_behind() -> None:
+    frame = next(SyntheticSource(seed=3, width=320, height=240, count=30).frames())
+    detect, pose = PhaseHough(radius_px=(8, 38)), CapFit(min_score=0.5)
+    for stage in (detect, pose):
+        stage.open()
+    _nrt.memsys_enable_stats()
+    balances = []
+    for _ in range(3):
+        circles = detect.process(frame, Mask(frame.gray > 0.4))
+        assert len(pose.process(frame, circles)[2]) > 5
+        del circles
+        stats = rtsys.get_allocation_stats()
+        balances.append((stats.alloc - stats.free, stats.mi_alloc - stats.mi_free))
+    assert balances[0] == balances[1] == balances[2]
+
+
+def test_a_kernel_that_counts_no_references_cannot_make_an_array() -> None:
+    @jitting.borrower
+    def make(n: int) -> float:
+        values = np.empty(n)
+        values[0] = 1.0
+        return float(values[0])
+
+    with pytest.raises(NumbaError, match="Only accept returning of array passed"):
+        make(3)

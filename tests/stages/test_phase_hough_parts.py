@@ -22,7 +22,7 @@ from mushpipe.stages.phase_features import (
 )
 from mushpipe.stages.phase_hough import PhaseHough, equal_area_radius
 from mushpipe.stages.phase_refit import DIRECTIONS, HIDDEN, directions_of
-from mushpipe.stages.phase_strips import Strips, in_strips
+from mushpipe.stages.phase_strips import Strips, in_strips, scratch_for
 from mushpipe.stages.phase_verifier import Verifier, load_verifier
 from mushpipe.stages.phase_votes import GAP, peaks, phase_of, rings_between, summed, vote
 from mushpipe.stages.verifier import weights_of
@@ -136,17 +136,18 @@ def test_a_direction_under_an_accepted_circle_is_not_free() -> None:
     hits[: n // 4] = 0
     hits[n // 4 : n // 2] = HIDDEN
     row, owner = np.zeros(7), np.full(len(found.x), -1, np.int32)
-    outline_features(found, shape, hits, owner, np.zeros((0, 5)), row)
+    scratch = scratch_for(len(found.x))
+    outline_features(found, shape, hits, owner, np.zeros((0, 5)), row, scratch)
     quarter = (n // 4) / n
     hidden = (n // 2 - n // 4) / n
     assert row[0] == pytest.approx(1 - hidden)
     assert row[1] == pytest.approx(quarter / (1 - hidden))
     assert row[3] == pytest.approx(math.log(1 + n // 4))
     above = np.array([[80.0, 45, 16, 0, 0]])
-    outline_features(found, shape, hits, owner, above, row)
+    outline_features(found, shape, hits, owner, above, row, scratch)
     assert row[0] < 1 - hidden
     owner[0] = 1
-    outline_features(found, shape, hits, owner, np.zeros((0, 5)), row)
+    outline_features(found, shape, hits, owner, np.zeros((0, 5)), row, scratch)
     assert row[1] == row[2] == row[3] == 0
 
 

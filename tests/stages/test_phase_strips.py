@@ -17,6 +17,7 @@ from mushpipe.stages.phase_strips import (
     gather,
     in_strips,
     outline_hits,
+    scratch_for,
 )
 
 Points = NDArray[np.float64]
@@ -56,8 +57,8 @@ def test_all_points_around_an_outline_are_found(
     seed: int, shape: tuple[float, ...], reach: float
 ) -> None:
     edges, outline = in_strips(scattered(seed), 120, 160), np.array(shape)
-    scratch = np.empty((2, len(edges.x)), np.int32)
-    found = scratch[0, : gather(edges, NOTHING, 0.0, outline, reach, scratch)]
+    scratch = scratch_for(len(edges.x))
+    found = scratch.rows[: gather(edges, NOTHING, 0.0, outline, reach, scratch)]
     _, off, facing = seen_from(edges, outline)
     surely = (off < reach - 1e-3) & (facing > TURNED + 1e-3)
     perhaps = (off < reach + 1e-3) & (facing > TURNED - 1e-3)
@@ -68,8 +69,8 @@ def test_all_points_around_an_outline_are_found(
 @pytest.mark.parametrize("place", [(-20.0, 60.0), (80.0, -20.0), (180.0, 60.0), (80.0, 140.0)])
 def test_points_beyond_the_image_are_found_from_beyond_it(place: tuple[float, float]) -> None:
     edges, outline = in_strips(scattered(3), 120, 160), np.array([*place, 20.0, 0.0, 0.0])
-    scratch = np.empty((2, len(edges.x)), np.int32)
-    found = scratch[0, : gather(edges, NOTHING, 0.0, outline, 4.0, scratch)]
+    scratch = scratch_for(len(edges.x))
+    found = scratch.rows[: gather(edges, NOTHING, 0.0, outline, 4.0, scratch)]
     _, off, facing = seen_from(edges, outline)
     assert set(found) == set(np.flatnonzero((off < 4) & (facing > TURNED)))
     assert len(found) > 0
@@ -79,8 +80,8 @@ def test_none_where_something_higher_hides_the_outline() -> None:
     edges, outline = in_strips(scattered(2), 120, 160), np.array([80.0, 60.0, 30.0, 0.0, 0.0])
     height = np.zeros((60, 80), np.float32)
     height[:, 56:] = 0.05  # from x = 112 on, 2 px beyond the outline's rightmost point
-    scratch = np.empty((2, len(edges.x)), np.int32)
-    found = scratch[0, : gather(edges, height, 0.01, outline, 6.0, scratch)]
+    scratch = scratch_for(len(edges.x))
+    found = scratch.rows[: gather(edges, height, 0.01, outline, 6.0, scratch)]
     angle, off, facing = seen_from(edges, outline)
     around = np.flatnonzero((off < 5.99) & (facing > TURNED + 1e-3))
     hidden = around[abs(angle[around]) < np.radians(15)]
@@ -93,7 +94,7 @@ def test_none_where_something_higher_hides_the_outline() -> None:
 @given(seed=st.integers(0, 5), shape=SHAPES, n=st.integers(20, 96))
 def test_each_direction_gets_its_nearest_point(seed: int, shape: tuple[float, ...], n: int) -> None:
     edges, outline, near = in_strips(scattered(seed), 120, 160), np.array(shape), 4.0
-    hits, scratch = np.zeros(96, np.int32), np.empty((2, len(edges.x)), np.int32)
+    hits, scratch = np.zeros(96, np.int32), scratch_for(len(edges.x))
     count, rms = outline_hits(edges, outline, near, n, hits, scratch)
     angle, off, facing = seen_from(edges, outline)
     turn = angle % (2 * np.pi) / (2 * np.pi) * n
