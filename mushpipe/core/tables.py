@@ -21,7 +21,7 @@ def locked(array: Any, dtype: Any) -> NDArray[Any]:
 
     What it is a view of becomes read-only too, or it could still change.
     """
-    result: NDArray[Any] = np.require(array, dtype, ["C_CONTIGUOUS"])
+    result: NDArray[Any] = np.asarray(array, dtype, order="C")
     part: Any = result
     while isinstance(part, np.ndarray):
         part.flags.writeable = False
@@ -86,8 +86,9 @@ class Columns:
         return len(getattr(self, first.name))
 
     def _require(self, condition: NDArray[np.bool_] | np.bool_ | bool, text: str) -> None:
-        if not np.all(condition):
-            rows = np.flatnonzero(~np.asarray(condition))
+        fine = np.asarray(condition)
+        if not fine.all():
+            rows = np.flatnonzero(~fine)
             raise ValueError(f"{type(self).__name__}: {text} (row {rows[0]})")
 
 
@@ -195,8 +196,8 @@ class Poses(Columns):
             known = _known(getattr(self, name))
             self._require(known == self.valid, f"{name} must be finite exactly where valid")
         for name in ("quaternion", "axis"):
-            norm = np.linalg.norm(getattr(self, name), axis=1)
-            self._require(~(np.abs(norm - 1) > 1e-6), f"{name} must have length 1")
+            square = np.einsum("ij,ij->i", getattr(self, name), getattr(self, name))
+            self._require(~(np.abs(square - 1) > 2e-6), f"{name} must have length 1")
         self._require(~(self.sigma_rad < 0), "a sigma must not be negative")
 
 

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.jit import jit
-from mushpipe.stages.linear import normal_equations, solve
+from mushpipe.core.jit import borrower, jit
+from mushpipe.stages.linear import solve
 
 Floats = NDArray[np.float64]
 Plane = NDArray[np.float32]
@@ -111,26 +111,50 @@ def fit_plane(points: Floats) -> Floats | None:
 def _biweight(basis: Floats, z: Floats) -> Floats:
     """Solve 1 / z = basis x by reweighting, from weights of 1."""
     inverse, misfit, weight = 1 / z, np.empty(len(z)), np.ones(len(z))
-    solution = np.zeros(basis.shape[1])
+    normal, solution = np.empty((3, 3)), np.zeros(3)
     for _ in range(20):
-        normal, right = normal_equations(basis, inverse, weight)
-        for i in range(len(right)):
-            normal[i, i] *= 1 + 1e-12  # points on one line determine no plane
-        solve(normal, right)
-        moved = np.abs(right - solution).max()
-        solution = right
-        if moved < 1e-4:  # 1/m
+        if _step(basis, inverse, weight, normal, solution) < 1e-4:  # 1/m
             break
-        for m in range(len(z)):
-            model = 0.0
-            for i in range(len(solution)):
-                model += basis[m, i] * solution[i]
-            above = 1 / max(model, 1e-3) - z[m]
-            misfit[m] = above / RISE_M if above > 0 else -above / FALL_M
+        _misfits(basis, z, solution, misfit)
         spread = max(1.0, 1.5 * np.median(misfit))  # wide while most does not fit
         for m in range(len(z)):
             weight[m] = max(0.0, 1 - (misfit[m] / spread) ** 2) ** 2 + 1e-6
     return solution
+
+
+@borrower
+def _step(
+    basis: Floats, inverse: Floats, weight: Floats, normal: Floats, solution: Floats
+) -> float:
+    """Renew the solution by weighted least squares; return how far it moved."""
+    aa = ab = ac = bb = bc = cc = az = bz = cz = 0.0
+    for m in range(len(inverse)):
+        a, b, c, w = basis[m, 0], basis[m, 1], basis[m, 2], weight[m]
+        wa, wb, wc = w * a, w * b, w * c
+        aa, ab, ac = aa + wa * a, ab + wa * b, ac + wa * c
+        bb, bc, cc = bb + wb * b, bc + wb * c, cc + wc * c
+        az, bz, cz = az + wa * inverse[m], bz + wb * inverse[m], cz + wc * inverse[m]
+    firm = 1 + 1e-12  # points on one line determine no plane
+    normal[0, 0], normal[0, 1], normal[0, 2] = aa * firm, ab, ac
+    normal[1, 0], normal[1, 1], normal[1, 2] = ab, bb * firm, bc
+    normal[2, 0], normal[2, 1], normal[2, 2] = ac, bc, cc * firm
+    before = (solution[0], solution[1], solution[2])
+    solution[0], solution[1], solution[2] = az, bz, cz
+    solve(normal, solution)
+    moved = 0.0
+    for i in range(3):
+        moved = max(moved, abs(solution[i] - before[i]))
+    return moved
+
+
+@borrower
+def _misfits(basis: Floats, z: Floats, solution: Floats, misfit: Floats) -> None:
+    """Fill how far (N,) the points lie off the plane, in what may rise and fall off the bed."""
+    a, b, c = solution[0], solution[1], solution[2]
+    for m in range(len(z)):
+        model = basis[m, 0] * a + basis[m, 1] * b + basis[m, 2] * c
+        above = 1 / max(model, 1e-3) - z[m]
+        misfit[m] = above / RISE_M if above > 0 else -above / FALL_M
 
 
 def plane_depth(coefficients: Floats, x: Floats, y: Floats) -> Floats:

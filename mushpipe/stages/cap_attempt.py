@@ -28,7 +28,7 @@ from mushpipe.stages.cap_samples import (
     sample_edges,
     touch,
 )
-from mushpipe.stages.cap_solve import ROUND, refine, variance_of_tilt, workspace
+from mushpipe.stages.cap_solve import ROUND, STAGES, refine, variance_of_tilt, workspace
 from mushpipe.stages.cap_start import CONICAL, USUAL, axis_of, start
 
 POOR = 0.9  # misfit (a usual cap has 0.25) at which a fit starts again; it widens the sigmas, too
@@ -57,6 +57,7 @@ class Room(NamedTuple):
         lanes: (LANES_ROOM,) and (2 DIRECTIONS,) for what is done in all directions at once.
         rival: Another start's fit.
         other: Another circle's fit.
+        grown: (3,) that circle: x, y, radius, px.
     """
 
     work: Any
@@ -64,6 +65,7 @@ class Room(NamedTuple):
     lanes: tuple[Singles, NDArray[np.int32]]
     rival: Fit
     other: Fit
+    grown: Floats
 
 
 @jit
@@ -76,7 +78,7 @@ def blank() -> Any:
 def scratch(height: int, width: int) -> Any:
     """Return a `Room` for images (H, W)."""
     lanes = (np.empty(LANES_ROOM, np.float32), np.empty(2 * DIRECTIONS, np.int32))
-    return Room(workspace(), room_to_cut(height, width), lanes, blank(), blank())
+    return Room(workspace(), room_to_cut(height, width), lanes, blank(), blank(), np.empty(3))
 
 
 @borrower
@@ -117,13 +119,13 @@ def attempt(
     """Fit a cap from where it starts: to its depth, then to its outline in colour as well.
 
     Args:
-        frame: As in `cap_batch.first_fits`.
+        frame: As in `fit_cap`.
         circle: (3,) x, y, radius, px.
         rank: Of the circle.
         size: Its radius at the cap, m.
         seen: The cap's rays (6, ROOM), with room for those of the outline, and how many there are.
         upright: Unit vector and spread of tilts, rad.
-        settings: As in `cap_batch.first_fits`.
+        settings: As in `fit_cap`.
         cap: (15,) parameters, in and out.
         room: From `scratch`; the last step's normal matrix, factored, stays in its workspace.
 
@@ -132,12 +134,12 @@ def attempt(
     """
     gray, image, focal = frame
     (rays, count), setting, work = seen, (settings[0], 1.0 / focal, size), room.work
-    if refine(cap, rays, count, upright, setting, (0, 2), work)[0] < 0.0:
+    if refine(cap, rays, count, upright, setting, STAGES[0], STAGES[1], work)[0] < 0.0:
         return 0, np.inf
     lines = sample_outline(
         gray, image[1], image[2], rank, cap, circle, focal, settings[2], room.lanes, rays[:, count:]
     )
-    total, misfit = refine(cap, rays, count + lines, upright, setting, (2, 4), work)
+    total, misfit = refine(cap, rays, count + lines, upright, setting, STAGES[1], STAGES[2], work)
     return (lines, misfit) if total >= 0.0 else (0, np.inf)
 
 
@@ -157,11 +159,11 @@ def fit_circle(
     """Fit the cap in a circle, from several starts if the first fit is poor; return the misfit.
 
     Args:
-        frame: As in `cap_batch.first_fits`.
+        frame: As in `fit_cap`.
         circle: (3,) x, y, radius, px.
         rank: Of the circle.
         upright: Unit vector and spread of tilts, rad.
-        settings: As in `cap_batch.first_fits`.
+        settings: As in `fit_cap`.
         fit: Out: rays (6, ROOM), parameters (15,), and counts (8,) of points, edge rays, outline
             rays, weight; size, m; misfit; points of other depth; variance of the tilt, rad^2, per
             direction. Without a fit the counts stay as they are and the misfit is infinite.
@@ -188,49 +190,66 @@ def fit_circle(
             if rest < BETTER * misfit:
                 lines, misfit, variance = found, rest, variance_of_tilt(normal)
                 take(rays, rival.rays, count, ROOM)
-                for i in range(SIZE):
-                    cap[i] = rival.cap[i]
+                put(cap, rival.cap)
     if np.isfinite(misfit):
         counts[0], counts[1], counts[2], counts[4], counts[6] = n, m, lines, size, other
         counts[7] = variance
     return misfit
 
 
-@jit
-def mend(
-    frame: Any, circle: Floats, ranks: tuple[int, int], misfit: float,
-    upright: tuple[Vector, float], settings: Any, fit: Any, room: Any,
-) -> None:  # fmt: skip
-    """Fit again in the circle that depth suggests, where depth denies the fit; the better stays.
+@borrower
+def denied_by(
+    frame: Any, circle: Floats, ranks: tuple[int, int], cap: Floats, bias: float, room: Any
+) -> int:
+    """Return in how many directions depth denies the outline of a cap (15,) fitted in a circle."""
+    expected_reach(cap, frame[1][1], frame[2], circle, *room.lanes)
+    return denials(frame[1], ranks, cap, bias, circle, room.lanes[0])
 
-    Not where much of the circle's depth lies elsewhere: it would be fitted to whatever hides it.
+
+@borrower
+def fit_cap(
+    frame: Any, circle: Floats, ranks: tuple[int, int], upright: tuple[Vector, float],
+    settings: Any, fit: Fit, room: Any,
+) -> None:  # fmt: skip
+    """Fit the cap in a circle; where depth denies it, in the circle that depth suggests, too.
+
+    The better fit stays. Not where much of the circle's depth lies elsewhere: it would be fitted to
+    whatever hides it.
 
     Args:
-        frame: As in `cap_batch.first_fits`.
+        frame: Luma (H, W); depth (H, W) m, missing where not above 0, with rays (H, W, 2) and
+            ranks (H, W); focal length, px.
         circle: (3,) x, y, radius, px, as detected.
         ranks: Of the circle, and of no circle.
-        misfit: Of the fit.
         upright: Unit vector and spread of tilts, rad.
-        settings: As in `cap_batch.first_fits`.
-        fit: As in `fit_circle`, in and out.
+        settings: `Noise`; sigma of depth (2), bias (m) and edge offset (px); sigma of the outline
+            in colour, px; fewest points.
+        fit: Out, as by `fit_circle`; without a fit it keeps its count of 0.
         room: From `scratch`.
     """
-    _, image, focal = frame
-    bias, other, reach = settings[1][2], room.other, room.lanes[0]
-    if fit.counts[6] > ASTRAY * (fit.counts[0] + fit.counts[6]):
+    misfit = fit_circle(frame, circle, ranks[0], upright, settings, fit, room)
+    astray = fit.counts[6] > ASTRAY * (fit.counts[0] + fit.counts[6])
+    if astray or not ODD < misfit < np.inf:
         return
-    grown = np.empty(3)
-    expected_reach(fit.cap, image[1], focal, circle, *room.lanes)
-    denied = denials(image, ranks, fit.cap, bias, circle, reach)
+    other, grown, bias = room.other, room.grown, settings[1][2]
+    denied = denied_by(frame, circle, ranks, fit.cap, bias, room)
     if misfit < POOR and denied < DENIED:
         return
     middle = fit.cap[2] - 0.5 * fit.cap[HEIGHT] + bias
-    if not regrow(image, ranks, circle, focal, middle, grown):
+    if not regrow(frame[1], ranks, circle, frame[2], middle, grown):
         return
     rest = fit_circle(frame, grown, ranks[0], upright, settings, other, room)
     if not rest < 2.0 * POOR:
         return  # neither is believed
-    expected_reach(other.cap, image[1], focal, grown, *room.lanes)
-    still = denials(image, ranks, other.cap, bias, grown, reach)
+    still = denied_by(frame, grown, ranks, other.cap, bias, room)
     if rest + DENIAL * still < MENDED * (misfit + DENIAL * denied):
-        fit.rays[:], fit.cap[:], fit.counts[:] = other
+        take(fit.rays, other.rays, 0, ROOM)
+        put(fit.cap, other.cap)
+        put(fit.counts, other.counts)
+
+
+@borrower
+def put(values: Floats, other: Floats) -> None:
+    """Copy other values of the same number."""
+    for i in range(len(values)):
+        values[i] = other[i]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import borrower, jit
-from mushpipe.stages.cap_attempt import COUNTS, ODD, POOR, Fit, fit_circle, mend, scratch
+from mushpipe.stages.cap_attempt import COUNTS, POOR, Fit, fit_cap, scratch
 from mushpipe.stages.cap_blocks import CELLS
 from mushpipe.stages.cap_circle import improve
 from mushpipe.stages.cap_model import (
@@ -29,7 +29,7 @@ from mushpipe.stages.cap_model import (
 )
 from mushpipe.stages.cap_order import Order
 from mushpipe.stages.cap_samples import ASTRAY, DIRECTIONS, ray_at
-from mushpipe.stages.cap_solve import ROUND, Noise, invert, refine, tilt
+from mushpipe.stages.cap_solve import ROUND, STAGES, Noise, invert, refine, tilt
 from mushpipe.stages.cap_start import spread_of
 
 ROUNDNESS = 0.01  # in rim radii: how far the rim of a cap is from the circle of its area
@@ -81,43 +81,22 @@ class Fits:
 
 
 @borrower
-def first_fit(
-    frame: Any, circle: Floats, ranks: tuple[int, int], upright: tuple[Vector, float],
-    settings: Any, fit: Fit, room: Any,
-) -> None:  # fmt: skip
-    """Gather the rays of a cap and fit it with the prior that is set, if need be in another circle.
-
-    Args:
-        frame: Luma (H, W); depth (H, W) m, missing where not above 0, with rays (H, W, 2) and
-            ranks (H, W); focal length, px.
-        circle: (3,) x, y, radius, px.
-        ranks: Of the circle, and of no circle.
-        upright: Unit vector and spread of tilts, rad.
-        settings: `Noise`; sigma of depth (2), bias (m) and edge offset (px); sigma of the outline
-            in colour, px; fewest points.
-        fit: Out, as by `fit_circle`; without a fit it keeps its count of 0.
-        room: From `scratch`.
-    """
-    misfit = fit_circle(frame, circle, ranks[0], upright, settings, fit, room)
-    if ODD < misfit < np.inf:
-        mend(frame, circle, ranks, misfit, upright, settings, fit, room)
-
-
-@borrower
 def second_fit(
     frame: Any, circle: Floats, upright: tuple[Vector, float], settings: Any, fit: Fit,
     covariance: Floats, told: Floats, room: Any,
 ) -> None:  # fmt: skip
     """Refine a fit with what the scene says of its cap's tilt, and then its circle, in place.
 
-    Arguments as `first_fit`, and out: covariance (8, 8), and what follows from the fit, (11,), as
+    Arguments as `fit_cap`, and out: covariance (8, 8), and what follows from the fit, (11,), as
     `locate` and `describe` fill it. If any of it is not finite, the count of points becomes 0.
     """
     _, image, focal = frame
     (rays, cap, counts), noise = fit, settings[0]
     count = ROUND + int(counts[0] + counts[1] + counts[2])
     setting = (noise, 1.0 / focal, counts[4])
-    counts[3], counts[5] = refine(cap, rays, count, upright, setting, (4, 5), room.work)
+    counts[3], counts[5] = refine(
+        cap, rays, count, upright, setting, STAGES[2], STAGES[3], room.work
+    )
     invert(room.work[0][0], covariance)
     held, doubt = (counts[1], counts[2]), max(1.0, counts[5] / POOR)
     improve(circle, cap, held, doubt, image[1], focal, room.lanes)
@@ -141,11 +120,11 @@ def fit_all(
     """Fit every cap, first with the same prior for all, then with what they say of the scene.
 
     Args:
-        frame: As in `first_fit`.
+        frame: As in `fit_cap`.
         circles: (N, 3) x, y, radius, px, in and out: improved.
         rank: (N,) of them, as `ranks` from `by_depth`.
-        upright: As in `first_fit`.
-        settings: As in `first_fit`.
+        upright: As in `fit_cap`.
+        settings: As in `fit_cap`.
         out: Per cap parameters, covariance, what follows, and counts, as by `second_fit`. A cap
             without a fit has a count of 0, and the rest says nothing.
     """
@@ -155,7 +134,7 @@ def fit_all(
     squares, variances, spreads = np.full(n, -1.0), np.ones(n), np.empty(n)
     for i in range(n):
         fit = Fit(rays[i], caps[i], counts[i])
-        first_fit(frame, circles[i], (rank[i], n), upright, settings, fit, room)
+        fit_cap(frame, circles[i], (rank[i], n), upright, settings, fit, room)
         if counts[i, 0] > 0:
             first, second = tilt(caps[i], upright[0])
             squares[i] = first * first + second * second

@@ -29,29 +29,21 @@ def multiply(flat: Singles, count: int, system: Any) -> None:
             products = dots(flat, i, j, count)
             for k in range(4):
                 normal[i, j + k] = products[k]
-        gradient[i] = dot(flat, i, UNKNOWNS, count)
+            gradient[i] = products[4]
 
 
 @inlined
-def dots(flat: Singles, i: int, j: int, count: int) -> tuple[float, float, float, float]:
-    """Return the products of row i with rows j to j + 3; four at once read row i but once."""
-    a = b = c = d = np.float32(0)
+def dots(flat: Singles, i: int, j: int, count: int) -> tuple[float, float, float, float, float]:
+    """Return the products of row i with rows j to j + 3 and the last: all at once read it once."""
+    a = b = c = d = e = np.float32(0)
     for k in range(count):
         x = flat[i * ROOM + k]
+        e += x * flat[UNKNOWNS * ROOM + k]
         a += x * flat[j * ROOM + k]
         b += x * flat[(j + 1) * ROOM + k]
         c += x * flat[(j + 2) * ROOM + k]
         d += x * flat[(j + 3) * ROOM + k]
-    return float(a), float(b), float(c), float(d)
-
-
-@inlined
-def dot(flat: Singles, i: int, j: int, count: int) -> float:
-    """Return the product of rows i and j."""
-    total = np.float32(0)
-    for k in range(count):
-        total += flat[i * ROOM + k] * flat[j * ROOM + k]
-    return float(total)
+    return float(a), float(b), float(c), float(d), float(e)
 
 
 @borrower

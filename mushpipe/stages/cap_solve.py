@@ -40,6 +40,9 @@ BULGE_LIMIT = 0.15  # beyond, the profile is no longer convex
 POINT_CUTS = np.array([400.0, 81.0, 81.0, 16.0])
 TOUCH_CUTS = np.array([25.0, 25.0, 9.0, 9.0])
 STEPS = len(POINT_CUTS)
+# steps to the depth alone, with the outline in colour, and with what the scene says; in an array,
+# for of literals in the code each pair would make numba compile another `refine`
+STAGES = np.array([0, 2, 4, 5])
 
 
 class Noise(NamedTuple):
@@ -208,7 +211,8 @@ def refine(
     count: int,
     upright: tuple[Vector, float],
     settings: tuple[Any, float, float],
-    steps: tuple[int, int],
+    first: int,
+    last: int,
     work: Any,
 ) -> tuple[float, float]:
     """Take Gauss-Newton steps, and leave the last one's normal matrix, factored, in `work`.
@@ -219,7 +223,8 @@ def refine(
         count: How many columns are rays.
         upright: Unit vector and the spread of tilts off it, rad.
         settings: `Noise`, the angle of a pixel (rad), and the size of the circle at the cap (m).
-        steps: Numbers of the first step and past the last.
+        first: Number of the first step.
+        last: Past the last.
         work: From `workspace`.
 
     Returns:
@@ -230,7 +235,7 @@ def refine(
     noise, pixel, size = settings
     total, misfit = 0.0, 0.0
     padded = fill_up(rays, count)
-    for step in range(steps[0], steps[1]):
+    for step in range(first, last):
         fill_rows(cap, rays, padded, flat)
         total, misfit = weigh(rows, rays, padded, noise, pixel, cap[RADIUS], step, weights)
         variance = (noise.circle_px * pixel * cap[2]) ** 2 + (noise.outline * cap[RADIUS]) ** 2

@@ -145,7 +145,7 @@ def sources(circles: Circles, depth: NDArray[np.float32]) -> NDArray[np.uint8]:
     u, v = np.rint(circles.center).astype(int).T
     height, width = depth.shape
     inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    measured = inside & (depth[v.clip(0, height - 1), u.clip(0, width - 1)] > 0)
+    measured = inside & (depth[np.where(inside, v, 0), np.where(inside, u, 0)] > 0)
     return np.where(measured, DepthSource.MEASURED, DepthSource.NEIGHBOURS).astype(np.uint8)
 
 
