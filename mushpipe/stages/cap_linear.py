@@ -13,12 +13,12 @@ Six = tuple[float, float, float, float, float, float]
 
 
 @borrower
-def multiply(flat: Singles, count: int, system: Any) -> None:
-    """Fill the lower triangle of a normal matrix, and the gradient, from weighted rows.
+def multiply(flat: Singles, weights: Singles, count: int, system: Any) -> None:
+    """Fill the lower triangle of a normal matrix, and the gradient, from rows and their weights.
 
     Args:
-        flat: (9 ROOM or more,) rows of ROOM: derivatives and residual, times the root of their
-            weight.
+        flat: (9 ROOM or more,) rows of ROOM: derivatives and residual.
+        weights: (ROOM,) of the columns.
         count: How many columns are rows.
         system: Normal matrix (8, 8) and gradient (8,), out; above the diagonal there may be
             anything.
@@ -26,34 +26,26 @@ def multiply(flat: Singles, count: int, system: Any) -> None:
     normal, gradient = system
     for i in range(UNKNOWNS):
         for j in range(0, i + 1, 4):
-            products = dots(flat, i, j, count)
+            products = dots(flat, weights, i, j, count)
             for k in range(4):
                 normal[i, j + k] = products[k]
             gradient[i] = products[4]
 
 
 @inlined
-def dots(flat: Singles, i: int, j: int, count: int) -> tuple[float, float, float, float, float]:
-    """Return the products of row i with rows j to j + 3 and the last: all at once read it once."""
+def dots(
+    flat: Singles, weights: Singles, i: int, j: int, count: int
+) -> tuple[float, float, float, float, float]:
+    """Return weighted products of row i with rows j to j + 3 and the last: read once for all."""
     a = b = c = d = e = np.float32(0)
     for k in range(count):
-        x = flat[i * ROOM + k]
+        x = weights[k] * flat[i * ROOM + k]
         e += x * flat[UNKNOWNS * ROOM + k]
         a += x * flat[j * ROOM + k]
         b += x * flat[(j + 1) * ROOM + k]
         c += x * flat[(j + 2) * ROOM + k]
         d += x * flat[(j + 3) * ROOM + k]
     return float(a), float(b), float(c), float(d), float(e)
-
-
-@borrower
-def scale(rows: Singles, weights: Singles, count: int) -> None:
-    """Multiply `count` columns of rows (9, M) by the roots of their weights (M,)."""
-    for k in range(count):
-        weights[k] = np.sqrt(weights[k])
-    for i in range(UNKNOWNS + 1):
-        for k in range(count):
-            rows[i, k] *= weights[k]
 
 
 @borrower

@@ -32,7 +32,7 @@ Vector = tuple[float, float, float]
 LIP = 0.25  # depth of the margin below the rim plane, in rim radii
 SIZE = 15
 N, RADIUS, HEIGHT, BULGE, E1, E2 = 3, 6, 7, 8, 9, 12
-LANES = 32  # columns that a kernel works on at once
+LANES = 16  # columns that a kernel works on at once
 # most rays of a cap: 8 around the circle, 97 points, 32 each along depth and colour edge; in LANES
 ROOM = 192
 UNKNOWNS = 8  # C (3), turn along e1 and e2 (2), R, h, b

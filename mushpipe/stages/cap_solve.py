@@ -11,7 +11,6 @@ from mushpipe.stages.cap_linear import (
     cholesky,
     invert_factor,
     multiply,
-    scale,
     substitute,
     tukey,
 )
@@ -34,8 +33,7 @@ from mushpipe.stages.cap_model import (
 )
 
 ROUND = 8  # rays around the detected circle, the first columns of a cap's rays
-_TURN = np.arange(ROUND) * (2 * np.pi / ROUND)
-WAVES = (np.stack([np.ones(ROUND), np.cos(_TURN), np.sin(_TURN)]) / ROUND).astype(np.float32)
+DIAGONAL = Single(np.sqrt(0.5))  # cosine and sine of the rays between the axes
 BULGE_LIMIT = 0.15  # beyond, the profile is no longer convex
 POINT_CUTS = np.array([400.0, 81.0, 81.0, 16.0])
 TOUCH_CUTS = np.array([25.0, 25.0, 9.0, 9.0])
@@ -126,13 +124,13 @@ def weigh_circle(rows: Floats, variance: float, cut: float, weights: Floats) -> 
     Mean, cosine and sine of the rays' distance to the cap: they touch it on average; single ones
     need not, for the outline of a cap is no circle.
     """
+    share = Single(1 / ROUND)
     for i in range(UNKNOWNS + 1):
-        mean, cosine, sine = Single(0), Single(0), Single(0)
-        for j in range(ROUND):
-            mean += WAVES[0, j] * rows[i, j]
-            cosine += WAVES[1, j] * rows[i, j]
-            sine += WAVES[2, j] * rows[i, j]
-        rows[i, 0], rows[i, 1], rows[i, 2] = mean, cosine, sine
+        a, b, c, d = rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3]
+        e, f, g, h = rows[i, 4], rows[i, 5], rows[i, 6], rows[i, 7]
+        rows[i, 0] = share * (a + b + c + d + e + f + g + h)
+        rows[i, 1] = share * (a - e + DIAGONAL * (b - d - f + h))
+        rows[i, 2] = share * (c - g + DIAGONAL * (b + d - f - h))
     for w in range(3):
         # the mean of cos^2 is a half: a shift by d shows as d/2 in the cosine
         precision = (1.0 if w == 0 else 4.0) / variance
@@ -240,8 +238,7 @@ def refine(
         total, misfit = weigh(rows, rays, padded, noise, pixel, cap[RADIUS], step, weights)
         variance = (noise.circle_px * pixel * cap[2]) ** 2 + (noise.outline * cap[RADIUS]) ** 2
         weigh_circle(rows, variance, TOUCH_CUTS[min(step, STEPS - 1)], weights)
-        scale(rows, weights, padded)
-        multiply(flat, padded, system)
+        multiply(flat, weights, padded, system)
         add_priors(cap, upright, noise, system)
         if not cholesky(normal):
             return -1.0, misfit

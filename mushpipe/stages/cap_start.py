@@ -100,25 +100,23 @@ def spread_of(squares: Floats, variances: Floats, spread: float, out: Floats) ->
         spread: The spread per direction (rad) those fits were made with.
         out: (N,) out: the spread to fit each cap with, rad.
     """
-    count = len(squares)
-    data, mean = np.zeros(count), np.zeros(count)
+    count, square, before = len(squares), spread**2, spread**2
+    data, mean, seen = np.zeros(count), np.zeros(count), np.zeros(count)
     for i in range(count):
         if squares[i] >= 0.0:
             data[i] = max(1.0 / variances[i] - 1.0 / spread**2, 1e-6)
             mean[i] = squares[i] * (1.0 / variances[i] / data[i]) ** 2
-    square = spread**2
+            seen[i] = 1.0
     for _ in range(15):
-        total, number = PRIOR_CAPS * spread**2, PRIOR_CAPS
+        total, number, per_square = PRIOR_CAPS * spread**2, PRIOR_CAPS, 1.0 / square
         for i in range(count):
-            out[i] = square
-            if squares[i] < 0.0:
-                continue
-            precision = data[i] + 1.0 / square
-            expected = mean[i] * (data[i] / precision) ** 2 + 2.0 / precision
-            loose = (DEGREES + 2.0) / (DEGREES + expected / square)
-            out[i] = square / loose
-            total += 0.5 * loose * expected
-            number += 1.0
-        square = max(total / number, NARROWEST**2)
+            variance = 1.0 / (data[i] + per_square)
+            share = data[i] * variance
+            expected = mean[i] * share * share + 2.0 * variance
+            loose = (DEGREES + 2.0) / (DEGREES + expected * per_square)
+            out[i] = loose
+            total += seen[i] * 0.5 * loose * expected
+            number += seen[i]
+        before, square = square, max(total / number, NARROWEST**2)
     for i in range(count):
-        out[i] = np.sqrt(out[i])
+        out[i] = np.sqrt(before / out[i]) if seen[i] > 0.0 else np.sqrt(before)
