@@ -12,6 +12,7 @@ from mushpipe.stages.cap_model import Floats, Single, Singles
 
 GRID = 11
 HIDDEN = Single(-1)
+WIDEST = 32.0  # px, half width of a block from which on more pixels tell no more
 ENOUGH = 0.4  # share of a block's pixels that must have depth
 
 _CENTERS: Floats = (np.arange(GRID) + 0.5) / GRID * 2 - 1
@@ -61,9 +62,9 @@ def room_to_cut(height: int, width: int) -> Any:
 
 
 @inlined
-def half_width(radius: float, shape: tuple[int, int]) -> int:
-    """Return the half width of the blocks in a circle (px), in an image (H, W)."""
-    return int(min(np.floor(radius / GRID), float(shape[0] + shape[1])))
+def half_width(radius: float) -> int:
+    """Return the half width of the blocks in a circle (px)."""
+    return int(min(np.floor(radius / GRID), WIDEST))
 
 
 @borrower

@@ -70,7 +70,7 @@ def sample_depth(
         where there is none.
     """
     radius, blocks = circle[2], cut.blocks
-    half = half_width(radius, rays.shape[:2])
+    half = half_width(radius)
     average(window, circle, half, cut)
     middle = middle_depth(cut, half, CORE)
     if middle <= 0.0:

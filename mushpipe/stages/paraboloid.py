@@ -99,7 +99,7 @@ def sample_inner(
     Returns:
         Number of points, and the middle depth (m), 0 without any.
     """
-    half, blocks = half_width(disc[2], image[0].shape), cut.blocks
+    half, blocks = half_width(disc[2]), cut.blocks
     average(own_depth(image[0], image[2], rank, disc, 1.0, cut.own), disc, half, cut)
     middle = middle_depth(cut, half, DISC * DISC)
     if middle <= 0.0:

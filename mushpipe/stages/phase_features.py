@@ -15,8 +15,8 @@ from mushpipe.core.jit import borrower
 from mushpipe.stages.linear import solve
 from mushpipe.stages.phase_edges import Gradient, Plane, Rows, Shape
 from mushpipe.stages.phase_refit import COSINES, HIDDEN, SINES, Table
+from mushpipe.stages.phase_scratch import DIRECTIONS
 from mushpipe.stages.phase_steps import height_at, rises, step_up
-from mushpipe.stages.phase_strips import DIRECTIONS
 
 Bytes = NDArray[np.uint8]
 # heights and weights (P,), normal matrix (6, 6) and its right side, and (2, DIRECTIONS)

@@ -12,7 +12,7 @@ from pydantic import Field, PrivateAttr, model_validator
 
 from mushpipe import Circles, InputError, Mask, RgbdFrame, Stage
 from mushpipe.core.stage import GraphPath
-from mushpipe.stages.phase_decide import decide, polish
+from mushpipe.stages.phase_decide import decide
 from mushpipe.stages.phase_depth import NO_RELIEF, Relief, relief_of
 from mushpipe.stages.phase_edges import (
     Gradient,
@@ -25,6 +25,7 @@ from mushpipe.stages.phase_edges import (
 from mushpipe.stages.phase_features import LEARNED, NAMES, kinds, static_features
 from mushpipe.stages.phase_fuse import fused
 from mushpipe.stages.phase_learned import add_discs, agreement, candidates_of
+from mushpipe.stages.phase_polish import polish
 from mushpipe.stages.phase_refit import Table, refit
 from mushpipe.stages.phase_strips import Strips, in_strips
 from mushpipe.stages.phase_verifier import load_verifier

@@ -16,16 +16,9 @@ from numpy.typing import NDArray
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.linear import solve
 from mushpipe.stages.phase_edges import Plane, Rows, Shape, Singles
+from mushpipe.stages.phase_scratch import DIRECTIONS, Scratch, scratch_for
 from mushpipe.stages.phase_steps import step_up
-from mushpipe.stages.phase_strips import (
-    DIRECTIONS,
-    TURNED,
-    Scratch,
-    Strips,
-    gather,
-    outline_hits,
-    scratch_for,
-)
+from mushpipe.stages.phase_strips import TURNED, Strips, gather, outline_hits
 
 Table = NDArray[np.float64]
 # Cosine and sine of each direction, by how many directions there are.

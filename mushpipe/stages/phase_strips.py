@@ -10,15 +10,14 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mushpipe.core.jit import borrower, inlined, jit
 from mushpipe.stages.phase_edges import Edges, Plane, Rows, Shape, Singles
+from mushpipe.stages.phase_scratch import Scratch
 from mushpipe.stages.phase_steps import rises
 
 Single = np.float32
 STRIP = 16  # px
-DIRECTIONS = 96  # in which an outline is looked at, at most
 AROUND = 32  # sectors of an outline in which it is looked for what hides it
 # They are as wide as each other in |cos| + |sin| = 1, where a point's sector needs no arc tangent.
 _SIDE = np.repeat([1, -1], AROUND // 2)
@@ -55,36 +54,6 @@ class Strips(NamedTuple):
     starts: Rows
     height: int
     width: int
-
-
-class Scratch(NamedTuple):
-    """Room to work in, made once for all outlines.
-
-    Attributes:
-        rows: (M,) of edge points, M their number.
-        near: (M,) what is known of them.
-        off: (DIRECTIONS,) distances of hits, in 1/1000 px.
-        under: (DIRECTIONS,) whether accepted outlines cover a direction.
-        lanes: (2, DIRECTIONS) of whatever has a number per direction.
-        a: (5, 5) normal matrix.
-        b: (5,) its right side.
-    """
-
-    rows: Rows
-    near: Rows
-    off: Rows
-    under: Rows
-    lanes: Plane
-    a: NDArray[np.float64]
-    b: NDArray[np.float64]
-
-
-@jit
-def scratch_for(count: int) -> Scratch:
-    """Return room to work in with so many edge points."""
-    rows, lanes = np.empty((2, count), np.int32), np.empty((2, DIRECTIONS), np.int32)
-    planes = np.empty((2, DIRECTIONS), np.float32)
-    return Scratch(rows[0], rows[1], lanes[0], lanes[1], planes, np.empty((5, 5)), np.empty(5))
 
 
 @jit

@@ -22,7 +22,8 @@ from mushpipe.stages.phase_features import (
 )
 from mushpipe.stages.phase_hough import PhaseHough, equal_area_radius
 from mushpipe.stages.phase_refit import DIRECTIONS, HIDDEN, directions_of
-from mushpipe.stages.phase_strips import Strips, in_strips, scratch_for
+from mushpipe.stages.phase_scratch import scratch_for
+from mushpipe.stages.phase_strips import Strips, in_strips
 from mushpipe.stages.phase_verifier import Verifier, load_verifier
 from mushpipe.stages.phase_votes import GAP, peaks, phase_of, rings_between, summed, vote
 from mushpipe.stages.verifier import weights_of

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from mushpipe.stages.phase_edges import Edges
+from mushpipe.stages.phase_scratch import scratch_for
 from mushpipe.stages.phase_strips import (
     ALIGNED,
     RAY,
@@ -17,7 +18,6 @@ from mushpipe.stages.phase_strips import (
     gather,
     in_strips,
     outline_hits,
-    scratch_for,
 )
 
 Points = NDArray[np.float64]

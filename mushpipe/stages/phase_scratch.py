@@ -1,0 +1,43 @@
+"""Room that the detector's kernels work in, made once for all outlines of a frame."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mushpipe.core.jit import jit
+from mushpipe.stages.phase_edges import Plane, Rows
+
+DIRECTIONS = 96  # in which an outline is looked at, at most
+
+
+class Scratch(NamedTuple):
+    """Room to work in, made once for all outlines.
+
+    Attributes:
+        rows: (M,) of edge points, M their number.
+        near: (M,) what is known of them.
+        off: (DIRECTIONS,) distances of hits, in 1/1000 px.
+        under: (DIRECTIONS,) whether accepted outlines cover a direction.
+        lanes: (2, DIRECTIONS) of whatever has a number per direction.
+        a: (5, 5) normal matrix.
+        b: (5,) its right side.
+    """
+
+    rows: Rows
+    near: Rows
+    off: Rows
+    under: Rows
+    lanes: Plane
+    a: NDArray[np.float64]
+    b: NDArray[np.float64]
+
+
+@jit
+def scratch_for(count: int) -> Scratch:
+    """Return room to work in with so many edge points."""
+    rows, lanes = np.empty((2, count), np.int32), np.empty((2, DIRECTIONS), np.int32)
+    planes = np.empty((2, DIRECTIONS), np.float32)
+    return Scratch(rows[0], rows[1], lanes[0], lanes[1], planes, np.empty((5, 5)), np.empty(5))
