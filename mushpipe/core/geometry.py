@@ -142,8 +142,12 @@ def quaternion_from_axis(axis: Array) -> Array:
     """
     x, y, z = axis[:, 0], axis[:, 1], axis[:, 2]
     # q = (z_hat x axis, 1 + z_hat . axis), normalised
-    q = np.stack([-y, x, np.zeros_like(x), 1 + z], axis=1)
-    opposite = z < -1 + 1e-12
-    q[opposite] = [1.0, 0.0, 0.0, 0.0]
-    norm = np.linalg.norm(q, axis=1, keepdims=True)
-    return np.asarray(q / norm, dtype=np.float64)
+    q = np.zeros((len(axis), 4))
+    q[:, 0], q[:, 1], q[:, 3] = -y, x, 1 + z
+    q[z < -1 + 1e-12] = [1.0, 0.0, 0.0, 0.0]
+    return q / lengths(q)[:, None]
+
+
+def lengths(vectors: Array) -> Array:
+    """Return the lengths (N,) of vectors (N, k), in half the time of `np.linalg.norm`."""
+    return np.asarray(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)))

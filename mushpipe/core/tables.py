@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum, IntFlag
+from functools import cache, reduce
 from typing import Any, Self
 
 import numpy as np
@@ -43,53 +44,60 @@ class Columns:
 
     def __post_init__(self) -> None:
         length: int | None = None
-        for item in fields(self):  # type: ignore[arg-type]
-            if "shape" not in item.metadata:
-                continue
-            array = locked(getattr(self, item.name), item.metadata["dtype"])
-            shape = item.metadata["shape"]
-            if array.ndim != 1 + len(shape) or array.shape[1:] != shape:
+        for name, (shape, dtype) in self._columns().items():
+            array = locked(getattr(self, name), dtype)
+            if array.shape[1:] != shape or array.ndim == 0:
                 expected = ", ".join(["N", *map(str, shape)])
                 raise ValueError(
-                    f"{type(self).__name__}.{item.name} has shape {array.shape}, "
+                    f"{type(self).__name__}.{name} has shape {array.shape}, "
                     f"expected ({expected}{',' if not shape else ''})"
                 )
             if length is not None and len(array) != length:
                 raise ValueError(
-                    f"{type(self).__name__}.{item.name} has {len(array)} rows, expected {length}"
+                    f"{type(self).__name__}.{name} has {len(array)} rows, expected {length}"
                 )
             length = len(array)
-            object.__setattr__(self, item.name, array)
+            object.__setattr__(self, name, array)
         self.check()
 
     def check(self) -> None:
         """Raise ValueError where values contradict each other; overridden by each type."""
 
     @classmethod
+    def _columns(cls) -> dict[str, tuple[tuple[int, ...], np.dtype[Any]]]:
+        return _columns_of(cls)  # type: ignore[arg-type]  # a class is hashable
+
+    @classmethod
     def unknown(cls, n: int, **known: Any) -> Self:
         """Return n rows of which only the given fields are known: NaN, 0 or False elsewhere."""
         blank = {}
-        for item in fields(cls):  # type: ignore[arg-type]
-            if "shape" in item.metadata:
-                dtype = np.dtype(item.metadata["dtype"])
-                empty = np.nan if dtype.kind == "f" else 0
-                blank[item.name] = np.full((n, *item.metadata["shape"]), empty, dtype)
+        for name, (shape, dtype) in cls._columns().items():
+            blank[name] = np.full((n, *shape), np.nan if dtype.kind == "f" else 0, dtype)
         return cls(**{**blank, **known})
 
     def take(self, rows: NDArray[Any]) -> Self:
         """Return the given rows (indices or a mask), in that order."""
-        names = [item.name for item in fields(self) if "shape" in item.metadata]  # type: ignore[arg-type]
-        return replace(self, **{name: getattr(self, name)[rows] for name in names})  # type: ignore[type-var]
+        taken = {name: getattr(self, name)[rows] for name in self._columns()}
+        return replace(self, **taken)  # type: ignore[type-var]
 
     def __len__(self) -> int:
-        first = next(f for f in fields(self) if "shape" in f.metadata)  # type: ignore[arg-type]
-        return len(getattr(self, first.name))
+        return len(getattr(self, next(iter(self._columns()))))
 
-    def _require(self, condition: NDArray[np.bool_] | np.bool_ | bool, text: str) -> None:
-        fine = np.asarray(condition)
-        if not fine.all():
-            rows = np.flatnonzero(~fine)
-            raise ValueError(f"{type(self).__name__}: {text} (row {rows[0]})")
+    def _require(self, condition: NDArray[np.bool_], text: str) -> None:
+        """Raise ValueError with the first row of which a condition (N, ...) does not hold."""
+        if not condition.all():
+            row = np.argwhere(~condition)[0, 0]
+            raise ValueError(f"{type(self).__name__}: {text} (row {row})")
+
+
+@cache
+def _columns_of(kind: type[Columns]) -> dict[str, tuple[tuple[int, ...], np.dtype[Any]]]:
+    """Return the shape of a row and the dtype of each column of a type."""
+    return {
+        item.name: (item.metadata["shape"], np.dtype(item.metadata["dtype"]))
+        for item in fields(kind)  # type: ignore[arg-type]
+        if "shape" in item.metadata
+    }
 
 
 class DepthSource(IntEnum):
@@ -113,8 +121,15 @@ class PickFlag(IntFlag):
 
 
 def _known(values: Floats) -> NDArray[np.bool_]:
-    finite = np.isfinite(values)
-    return np.asarray(finite.all(axis=tuple(range(1, values.ndim))))
+    """Return which rows (N, k) are finite; `all` along an axis so short takes twice as long."""
+    return reduce(np.logical_and, np.isfinite(values).T)
+
+
+def first_of(ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return which rows (N,) have an id that no row before them has."""
+    first = np.zeros(len(ids), np.bool_)
+    first[np.unique(ids, return_index=True)[1]] = True
+    return first
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,11 +178,11 @@ class Locations(Columns):
         self._require(self.source <= max(DepthSource), "the source must be a DepthSource")
         present = self.source != DepthSource.MISSING
         self._require(_known(self.position) == present, "position must be NaN where missing")
-        self._require(_known(self.distance) == present, "distance must be NaN where missing")
+        self._require(np.isfinite(self.distance) == present, "distance must be NaN where missing")
         self._require(~(self.diameter <= 0), "the diameter must be positive or NaN")
         self._require(~(self.distance < 0), "the distance must not be negative")
-        for sigma in (self.sigma_position, self.sigma_diameter[:, None]):
-            self._require(~(sigma < 0).any(axis=1), "a sigma must not be negative")
+        for sigma in (self.sigma_position, self.sigma_diameter):
+            self._require(~(sigma < 0), "a sigma must not be negative")
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,7 +258,7 @@ class Picks(Columns):
 
     def check(self) -> None:
         """Ids are unique, and a pick without depth carries no position."""
-        self._require(len(np.unique(self.id)) == len(self.id), "ids must be unique")
+        self._require(first_of(self.id), "ids must be unique")
         present = self.source != DepthSource.MISSING
         for name in ("position", "surface"):
             known = _known(getattr(self, name))

@@ -19,6 +19,7 @@ from mushpipe.core.tables import (
     Picks,
     Poses,
     column,
+    first_of,
     locked,
 )
 
@@ -69,8 +70,8 @@ class Truth(Columns):
 
     def check(self) -> None:
         """Ids are unique, outlines known, fractions within 0..1, axes of length 1."""
-        self._require(len(np.unique(self.id)) == len(self.id), "ids must be unique")
-        self._require(np.isfinite(self.center).all(axis=1), "the centre must be finite")
+        self._require(first_of(self.id), "ids must be unique")
+        self._require(np.isfinite(self.center), "the centre must be finite")
         self._require((self.radius > 0) & np.isfinite(self.radius), "the radius must be positive")
         self._require(~((self.visible < 0) | (self.visible > 1)), "visible must be within 0..1")
         norm = np.linalg.norm(self.axis, axis=1)

@@ -121,14 +121,14 @@ def fit_all(
 
     Args:
         frame: As in `fit_cap`.
-        circles: (N, 3) x, y, radius, px, in and out: improved.
+        circles: (N, 3) x, y, radius, px.
         rank: (N,) of them, as `ranks` from `by_depth`.
         upright: As in `fit_cap`.
         settings: As in `fit_cap`.
-        out: Per cap parameters, covariance, what follows, and counts, as by `second_fit`. A cap
-            without a fit has a count of 0, and the rest says nothing.
+        out: Per cap its circle, improved; parameters, covariance, what follows, and counts, as by
+            `second_fit`. A cap without a fit keeps its circle and has a count of 0, the rest NaN.
     """
-    caps, covariances, told, counts = out
+    improved, caps, covariances, told, counts = out
     room, n = scratch(*frame[1][0].shape), len(circles)
     rays = np.empty((n, 6, ROOM), np.float32)
     squares, variances, spreads = np.full(n, -1.0), np.ones(n), np.empty(n)
@@ -141,9 +141,13 @@ def fit_all(
             variances[i] = counts[i, 7]
     spread_of(squares, variances, upright[1], spreads)
     for i in range(n):
+        improved[i] = circles[i]
         if counts[i, 0] > 0:
             fit, own = Fit(rays[i], caps[i], counts[i]), (upright[0], spreads[i])
-            second_fit(frame, circles[i], own, settings, fit, covariances[i], told[i], room)
+            second_fit(frame, improved[i], own, settings, fit, covariances[i], told[i], room)
+        if not counts[i, 0] > 0:
+            improved[i] = circles[i]
+            caps[i], covariances[i], told[i], counts[i, 3] = np.nan, np.nan, np.nan, np.nan
 
 
 @borrower
@@ -222,34 +226,24 @@ def fit_caps(
             and its growth (m per m), bias (m), and how much of an edge it loses (px); sigma of the
             outline in colour, px; the fewest points that make a fit.
     """
-    n, improved = len(circles), circles.copy()
-    gray, image, focal = frame
+    n, (gray, image, focal) = len(circles), frame
     out = (
-        np.full((n, SIZE), np.nan),
-        np.full((n, UNKNOWNS, UNKNOWNS), np.nan),
-        np.full((n, TOLD), np.nan),
+        np.empty((n, 3)),
+        np.empty((n, SIZE)),
+        np.empty((n, UNKNOWNS, UNKNOWNS)),
+        np.empty((n, TOLD)),
         np.zeros((n, COUNTS)),
     )
     rank, ranks = order
     up = (float(upright[0][0]), float(upright[0][1]), float(upright[0][2]))
-    fit_all((gray, (*image, ranks), focal), improved, rank, (up, upright[1]), settings, out)
-    return _fits(circles, improved, *out)
+    fit_all((gray, (*image, ranks), focal), circles, rank, (up, upright[1]), settings, out)
+    return _fits(*out)
 
 
-def _fits(
-    circles: Floats,
-    improved: Floats,
-    caps: Floats,
-    covariances: Floats,
-    told: Floats,
-    counts: Floats,
-) -> Fits:
-    valid = counts[:, 0] > 0
-    for array in (caps, covariances, told):
-        array[~valid] = np.nan
+def _fits(circles: Floats, caps: Floats, covariances: Floats, told: Floats, counts: Floats) -> Fits:
     return Fits(
-        valid,
-        np.where(valid[:, None], improved, circles),
+        counts[:, 0] > 0,
+        circles,
         caps[:, :3],
         caps[:, N : N + 3],
         caps[:, RADIUS],
@@ -260,7 +254,7 @@ def _fits(
         told[:, 6],
         told[:, 7],
         told[:, 3:6],
-        np.where(valid, np.minimum(counts[:, 3] / len(CELLS), 1.0), np.nan),
+        np.minimum(counts[:, 3] / len(CELLS), 1.0),
         counts[:, 1].astype(np.int64),
         counts[:, 2].astype(np.int64),
         counts[:, 5],

@@ -176,11 +176,17 @@ def middle_depth(cut: Cut, half: int, core: float) -> float:
 
 @borrower
 def median(values: Singles, n: int) -> float:
-    """Return the median of the first n values, which it sorts; 0 without any."""
-    for i in range(1, n):
-        value, k = values[i], i
-        while k > 0 and values[k - 1] > value:
-            values[k] = values[k - 1]
-            k -= 1
-        values[k] = value
-    return 0.5 * float(values[(n - 1) // 2] + values[n // 2]) if n else 0.0
+    """Return the median of the first n values; 0 without any.
+
+    Counts for each how many are smaller and how many are not larger: for some tens of values that
+    is faster than to sort them, since no branch depends on them.
+    """
+    lower, upper = Single(0), Single(0)
+    for i in range(n):
+        value, smaller, equal = values[i], np.int32(0), np.int32(0)
+        for j in range(n):
+            smaller += np.int32(values[j] < value)
+            equal += np.int32(values[j] == value)
+        lower = value if smaller <= (n - 1) // 2 < smaller + equal else lower
+        upper = value if smaller <= n // 2 < smaller + equal else upper
+    return 0.5 * float(lower + upper)

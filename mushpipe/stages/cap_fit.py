@@ -17,6 +17,7 @@ from mushpipe import (
     Stage,
     quaternion_from_axis,
 )
+from mushpipe.core.geometry import lengths
 from mushpipe.stages.cap_batch import Fits, fit_caps
 from mushpipe.stages.cap_order import Order, by_depth
 from mushpipe.stages.cap_solve import Noise
@@ -165,8 +166,9 @@ class CapFit(Stage):
         discs = _discs(circles)
         noise = (self.depth_noise_mm / 1000, self.depth_noise_per_m / 1000)
         surface, covariance, _ = fit_tops(depth, camera, discs, noise, LEAST, holes, order)
-        rows = holes[np.isfinite(surface[holes, 0])]
-        tops, discs = (surface[rows], covariance[rows]), discs[rows]
+        fitted = np.isfinite(surface[:, 0])
+        tops, rows = (surface[fitted], covariance[fitted]), holes[fitted]
+        discs = discs[rows]
         focal = (camera.fx + camera.fy) / 2
         z = tops[0][:, 0] - self.depth_bias_mm / 1000
         size, pixel = discs[:, 2] * z / focal, self.circle_sigma_px * z / focal
@@ -182,7 +184,7 @@ def _discs(circles: Circles) -> Floats:
 def _locations(fits: Fits, source: NDArray[np.uint8]) -> Locations:
     return Locations(
         position=fits.surface,
-        distance=np.linalg.norm(fits.surface, axis=1),
+        distance=lengths(fits.surface),
         diameter=2 * fits.radius,
         source=source,
         sigma_position=fits.sigma_surface,

@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.cap_blocks import median
-from mushpipe.stages.cap_model import Floats, Singles
+from mushpipe.stages.cap_model import LANES, Floats, Singles
 
+WIDE = 32767.0  # columns, more than any image has
 Order = tuple[NDArray[np.int64], NDArray[np.int16]]
 
 
@@ -24,10 +25,19 @@ def paint(ranks: NDArray[np.int16], circles: Floats, order: NDArray[np.int64]) -
     height, width = ranks.shape
     for rank in range(len(order) - 1, -1, -1):
         x, y, r = circles[order[rank]]
+        first = min(max(0, int(np.ceil(x - r))), width)
+        beyond = max(first, min(width, int(np.floor(x + r)) + 1))
+        beyond = min(width, first + (beyond - first + LANES - 1) // LANES * LANES)
+        value = np.int16(rank)
         for v in range(max(0, int(np.ceil(y - r))), min(height, int(np.floor(y + r)) + 1)):
             half = np.sqrt(max(r * r - (v - y) ** 2, 0.0))
-            left = max(0, int(np.ceil(x - half)))
-            ranks[v, left : max(left, min(width, int(np.floor(x + half)) + 1))] = rank
+            # of every row the same columns: loops of one length are foreseen by the processor
+            row = ranks[v, first:beyond]
+            left = np.int16(max(np.ceil(x - half) - first, 0.0))
+            right = np.int16(min(np.floor(x + half) - first, WIDE))
+            for j in range(beyond - first):
+                column = np.int16(j)
+                row[j] = value if (left <= column) & (column <= right) else row[j]
 
 
 @borrower

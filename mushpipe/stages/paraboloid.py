@@ -61,22 +61,23 @@ def fit_surfaces(
         focal: Focal length, px.
         noise: Sigma of depth is noise[0] + noise[1] z, m.
         least: Fewest points.
-        out: Coefficients (N, 7) m and covariances (N, 7, 7); those without a fit stay as they are.
+        out: Coefficients (M, 7) m and covariances (M, 7, 7); those without a fit stay as they are.
 
     Returns:
-        (N, 2) how many points of the whole grid have depth of the cap, and how many other depth.
+        (M, 2) how many points of the whole grid have depth of the cap, and how many other depth.
     """
     near = np.empty((COEFFICIENTS + 2, len(INNER)))
     weighted = np.empty((COEFFICIENTS + 1, len(INNER)))
     cut = room_to_cut(*image[0].shape)
-    seen = np.zeros((len(discs), 2), np.int64)
-    for i in rows:
+    seen = np.zeros((len(rows), 2), np.int64)
+    for k in range(len(rows)):
+        i = rows[k]
         n, middle = sample_inner(image, rank[i], discs[i], focal, noise, cut, near)
         size = discs[i, 2] * middle / focal
-        if n >= least and paraboloid(near, n, size, weighted, out[0][i], out[1][i]):
-            out[0][i, 0] += middle
+        if n >= least and paraboloid(near, n, size, weighted, out[0][k], out[1][k]):
+            out[0][k, 0] += middle
             gate = (middle - 0.8 * size, middle + size)
-            seen[i, 0], seen[i, 1] = count_seen(image, rank[i], discs[i], gate)
+            seen[k, 0], seen[k, 1] = count_seen(image, rank[i], discs[i], gate)
     return seen
 
 

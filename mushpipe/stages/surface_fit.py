@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mushpipe import Camera, Circles, DepthSource, InputError, Locations, RgbdFrame, Stage
+from mushpipe.core.jit import borrower
 from mushpipe.stages.cap_blocks import CELLS
 from mushpipe.stages.cap_order import Order, by_depth
 from mushpipe.stages.cap_samples import ASTRAY
@@ -96,7 +97,9 @@ def fit_tops(
     rows: NDArray[np.intp] | None = None,
     order: Order | None = None,
 ) -> tuple[Floats, Floats, NDArray[np.int64]]:
-    """Return coefficients (N, 7), m, covariances (N, 7, 7) and numbers of points (N, 2).
+    """Return coefficients (M, 7), m, covariances (M, 7, 7) and numbers of points (M, 2).
+
+    A circle without a fit has NaN.
 
     Args:
         depth: (H, W) m, missing where not above 0.
@@ -104,15 +107,16 @@ def fit_tops(
         discs: (N, 3) x, y, radius, px.
         noise: Sigma of depth at the camera, m, and its growth, m per m.
         least: Fewest points.
-        rows: (M,) which are fitted, all unless given; the others are NaN, but hide what they cover.
+        rows: (M,) which are fitted, all unless given; the others only hide what they cover.
         order: From `by_depth`, if that is known.
     """
-    n, (rank, ranks) = len(discs), order or by_depth(depth, discs)
+    rank, ranks = order or by_depth(depth, discs)
     image = (depth, pixel_rays(camera), ranks)
+    chosen = np.arange(len(discs)) if rows is None else rows
+    n = len(chosen)
     surface = np.full((n, COEFFICIENTS), np.nan)
     covariance = np.full((n, COEFFICIENTS, COEFFICIENTS), np.nan)
     focal = (camera.fx + camera.fy) / 2
-    chosen = np.arange(n) if rows is None else rows
     seen = fit_surfaces(image, discs, rank, chosen, focal, noise, least, (surface, covariance))
     return surface, covariance, seen
 
@@ -142,11 +146,20 @@ def variance_along(surface: Floats, covariance: Floats, size: Floats, pixel: Flo
 
 def sources(circles: Circles, depth: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Return where the depth at the centres (N,) comes from: from there, or from around it."""
-    u, v = np.rint(circles.center).astype(int).T
-    height, width = depth.shape
-    inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    measured = inside & (depth[np.where(inside, v, 0), np.where(inside, u, 0)] > 0)
-    return np.where(measured, DepthSource.MEASURED, DepthSource.NEIGHBOURS).astype(np.uint8)
+    found = np.full(len(circles), DepthSource.NEIGHBOURS, np.uint8)
+    _mark_measured(circles.center, depth, int(DepthSource.MEASURED), found)
+    return found
+
+
+@borrower
+def _mark_measured(
+    center: Floats, depth: NDArray[np.float32], mark: int, found: NDArray[np.uint8]
+) -> None:
+    """Write a mark (N,) for each centre (N, 2), px, at which there is depth (H, W)."""
+    for i in range(len(center)):
+        u, v = np.rint(center[i, 0]), np.rint(center[i, 1])
+        if 0 <= u < depth.shape[1] and 0 <= v < depth.shape[0] and depth[int(v), int(u)] > 0:
+            found[i] = mark
 
 
 def diameters(

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
 from mushpipe import Camera
+from mushpipe.core.jit import borrower
 from mushpipe.stages.bed import CELL, far_cells, fit_plane
 
 Floats = NDArray[np.float64]
@@ -44,13 +45,23 @@ def bed_normal(depth: NDArray[np.float32], rays: NDArray[np.float32]) -> Floats 
         None where there is too little depth.
     """
     far = far_cells(depth, CELL)
-    far[..., :2] = rays[far[..., 1].astype(int), far[..., 0].astype(int)]
-    far[far[..., 0] > 1e3] = np.nan
+    _look(far, rays)
     plane = fit_plane(far)
     if plane is None:
         return None
     c, a, b = plane
     return -np.array([a, b, c]) / float(np.linalg.norm(plane))
+
+
+@borrower
+def _look(far: Floats, rays: NDArray[np.float32]) -> None:
+    """Put the rays of cells (rows, columns, 3) in the place of their pixels; NaN without one."""
+    for i in range(far.shape[0]):
+        for j in range(far.shape[1]):
+            x, y = rays[int(far[i, j, 1]), int(far[i, j, 0])]
+            far[i, j, 0], far[i, j, 1] = x, y
+            if x > 1e3:
+                far[i, j, 2] = np.nan
 
 
 @lru_cache(maxsize=4)
