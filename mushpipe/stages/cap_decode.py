@@ -6,11 +6,14 @@ where it is the largest of its 3x3 neighbourhood.
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.evaluate.matching import circle_iou
+from mushpipe.core.jit import borrower
+from mushpipe.stages.discs import iou
 
 Floats = NDArray[np.float64]
 Maps = NDArray[np.float32]
@@ -44,9 +47,19 @@ def circles_of(maps: Maps, least: float) -> tuple[Floats, Floats]:
 
 def first_of_each(circles: Floats, overlap: float) -> NDArray[np.intp]:
     """Return the rows of circles (N, 3) that overlap no kept row before by more than an IoU."""
-    iou = circle_iou(circles[:, :2], circles[:, 2], circles[:, :2], circles[:, 2])
     free = np.ones(len(circles), bool)
-    for row in range(len(circles)):
-        if free[row]:
-            free[row + 1 :] &= iou[row, row + 1 :] <= overlap
+    _suppress(circles, overlap, free)
     return np.flatnonzero(free)
+
+
+@borrower
+def _suppress(circles: Floats, overlap: float, free: NDArray[np.bool_]) -> None:
+    for row in range(len(circles)):
+        x, y, radius = circles[row]
+        for before in range(row):
+            u, v, other = circles[before]
+            squared = (x - u) ** 2 + (y - v) ** 2
+            meets = free[before] and squared < (radius + other) ** 2
+            if meets and iou(math.sqrt(squared), radius, other) > overlap:
+                free[row] = False
+                break

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import borrower, jit
+from mushpipe.stages.discs import lens
 from mushpipe.stages.phase_edges import Rows, Shape, Singles
 from mushpipe.stages.phase_refit import (
     COSINES,
@@ -30,23 +31,6 @@ from mushpipe.stages.verifier import LIMIT
 MARGIN = 1.0  # px; so far within an accepted circle an outline counts as hidden by it
 HOPELESS = 2e-5  # probability from which on nothing that is accepted later can help
 TAKEN = 2.5  # px; edges so near an accepted outline are its own
-
-
-@borrower
-def lens(distance: float, first: float, second: float) -> float:
-    """Return the area that two circles share."""
-    if distance >= first + second:
-        return 0.0
-    small = min(first, second)
-    if distance <= abs(first - second):
-        return math.pi * small * small
-    a = (distance**2 + first**2 - second**2) / (2 * distance * first)
-    b = (distance**2 + second**2 - first**2) / (2 * distance * second)
-    k = (first + second - distance) * (distance + first - second)
-    k *= (distance - first + second) * (distance + first + second)
-    triangle = 0.5 * math.sqrt(max(k, 0.0))
-    sectors = first**2 * math.acos(min(1, max(-1, a))) + second**2 * math.acos(min(1, max(-1, b)))
-    return sectors - triangle
 
 
 @borrower

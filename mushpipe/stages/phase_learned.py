@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mushpipe import Circles
 from mushpipe.core.jit import borrower, jit
-from mushpipe.stages.phase_decide import lens
+from mushpipe.stages.discs import iou
 from mushpipe.stages.phase_edges import Plane
 from mushpipe.stages.phase_refit import Table
 
@@ -57,7 +57,5 @@ def _agreement(shapes: Table, radius: Table, center: Table, of: Table, score: Ta
             dx, dy = shapes[k, 0] - center[m, 0], shapes[k, 1] - center[m, 1]
             squared = dx * dx + dy * dy
             if squared < (radius[k] + of[m]) ** 2:
-                shared = lens(math.sqrt(squared), radius[k], of[m])
-                total = math.pi * (radius[k] ** 2 + of[m] ** 2)
-                best[k] = max(best[k], score[m] * shared / (total - shared))
+                best[k] = max(best[k], score[m] * iou(math.sqrt(squared), radius[k], of[m]))
     return best

@@ -73,8 +73,9 @@ class Tracks:
             position=locations.position,
             size=locations.diameter / 2,
         )
-        old = _moved(self._known, new, image)
-        rows, columns = _assign(_distances(new, old))
+        old, flat = _moved(self._known, new, image)
+        deep = _deep(new, old)
+        rows, columns = _assign(np.where(np.isfinite(deep), deep, flat))
         ids = new.id.copy()
         ids[rows] = old.id[columns]
         fresh = np.flatnonzero(ids < 0)
@@ -87,11 +88,14 @@ class Tracks:
         return ids
 
 
-def _distances(new: Sightings, old: Sightings) -> Floats:
-    """Return how far each new mushroom (N) is from each old one (M), in gates; 1 is the limit."""
-    flat = _steps(new.center, old.center) / _gates(new.radius, old.radius)
-    deep = _steps(new.position, old.position) / _gates(new.size, old.size)
-    return np.where(np.isfinite(deep), deep, flat)
+def _flat(new: Sightings, old: Sightings) -> Floats:
+    """Return how far each new mushroom (N) is from each old one (M) in the image, in gates."""
+    return _steps(new.center, old.center) / _gates(new.radius, old.radius)
+
+
+def _deep(new: Sightings, old: Sightings) -> Floats:
+    """Return the same (N, M) in 3D, NaN where that is not known."""
+    return _steps(new.position, old.position) / _gates(new.size, old.size)
 
 
 def _steps(new: Floats, old: Floats) -> Floats:
@@ -111,30 +115,27 @@ def _assign(distances: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     return rows[inside], columns[inside]
 
 
-def _moved(old: Sightings, new: Sightings, image: tuple[int, int]) -> Sightings:
-    """Return the old mushrooms where they are expected now.
+def _moved(old: Sightings, new: Sightings, image: tuple[int, int]) -> tuple[Sightings, Floats]:
+    """Return the old mushrooms where they are expected now, and how far that is from the new ones.
 
     They are expected where they were, unless they all shifted: unless a shift brings at least half
     of those still in view, and more than no shift does, onto new ones.
     """
-    stayed = _near(new, old).any(axis=0).sum()
+    flat = _flat(new, old)
+    stayed = (flat <= 1).any(axis=0).sum()
     if min(len(new), len(old)) < FEWEST or stayed > 0.9 * min(len(new), len(old)):
-        return old
+        return old, flat
     shifted = replace(old, center=old.center + _common_shift(new, old))
-    near = _near(new, shifted)
+    apart = _flat(new, shifted)
+    near = apart <= 1
     in_view = ((shifted.center >= 0) & (shifted.center < image)).all(axis=1).sum()
     if near.any(axis=0).sum() < max(FEWEST, stayed + 1, 0.5 * in_view):
-        return old
+        return old, flat
     deep = (new.position[:, None] - old.position[None])[near]
     known = deep[np.isfinite(deep).all(axis=1)]
     # without a shift in 3D the assignment falls back to the image
     step = np.median(known, axis=0) if len(known) else np.full(3, np.nan)
-    return replace(shifted, position=old.position + step)
-
-
-def _near(new: Sightings, old: Sightings) -> NDArray[np.bool_]:
-    """Return which pairs (N, M) lie within a gate in the image."""
-    return np.asarray(_steps(new.center, old.center) <= _gates(new.radius, old.radius))
+    return replace(shifted, position=old.position + step), apart
 
 
 def _common_shift(new: Sightings, old: Sightings) -> Floats:

@@ -10,7 +10,8 @@ import pytest
 from mushpipe import Mask
 from mushpipe.core.errors import UsageError
 from mushpipe.stages.bed import far_cells, fit_plane, plane_depth
-from mushpipe.stages.phase_decide import lens, outline_features, overlap_features, probability
+from mushpipe.stages.discs import lens
+from mushpipe.stages.phase_decide import outline_features, overlap_features, probability
 from mushpipe.stages.phase_depth import GRID, closed, halved, relief_of
 from mushpipe.stages.phase_edges import edges_of, gradient_of, otsu_of
 from mushpipe.stages.phase_features import (

@@ -1,0 +1,37 @@
+"""What two circles share, as kernels of other stages ask for it, pair by pair."""
+
+from __future__ import annotations
+
+import math
+
+from mushpipe.core.jit import borrower
+
+
+@borrower
+def lens(distance: float, first: float, second: float) -> float:
+    """Return the area that two circles share.
+
+    Args:
+        distance: Of their centres.
+        first: Radius of one.
+        second: Of the other.
+    """
+    if distance >= first + second:
+        return 0.0
+    small = min(first, second)
+    if distance <= abs(first - second):
+        return math.pi * small * small
+    a = (distance**2 + first**2 - second**2) / (2 * distance * first)
+    b = (distance**2 + second**2 - first**2) / (2 * distance * second)
+    k = (first + second - distance) * (distance + first - second)
+    k *= (distance - first + second) * (distance + first + second)
+    triangle = 0.5 * math.sqrt(max(k, 0.0))
+    sectors = first**2 * math.acos(min(1, max(-1, a))) + second**2 * math.acos(min(1, max(-1, b)))
+    return sectors - triangle
+
+
+@borrower
+def iou(distance: float, first: float, second: float) -> float:
+    """Return the intersection over union of two circles; arguments as `lens`."""
+    shared = lens(distance, first, second)
+    return shared / (math.pi * (first**2 + second**2) - shared)
