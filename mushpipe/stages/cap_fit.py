@@ -74,6 +74,7 @@ class CapFit(Stage):
         gray.flags.writeable = depth.flags.writeable = False
         order = by_depth(depth, _discs(circles))
         fits = self.fit(gray, depth, camera, circles, order)
+        sources(circles, depth)
         self._bridge(np.arange(1), fits, depth, camera, circles, order)
         if self.min_score is not None:
             chances(circles, fits)

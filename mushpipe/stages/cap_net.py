@@ -15,6 +15,7 @@ from mushpipe import Circles, GraphPath, Header, Mask, RgbdFrame, Stage
 from mushpipe.core.errors import UsageError
 from mushpipe.core.jit import borrower
 from mushpipe.core.onnx_file import OnnxFile
+from mushpipe.core.tables import locked
 from mushpipe.stages.cap_decode import (
     CHANNELS,
     MASK,
@@ -123,9 +124,9 @@ class CapNet(Stage):
         net = self._load()
         bottom, right = (-n % _BLOCK for n in color.shape[:2])
         if bottom or right:
-            color = np.asarray(
-                cv2.copyMakeBorder(color, 0, bottom, 0, right, cv2.BORDER_REPLICATE), np.uint8
-            )
+            color = cv2.copyMakeBorder(color, 0, bottom, 0, right, cv2.BORDER_REPLICATE)
+        # read-only as a frame's: to the compiler another type, and another kernel
+        color = locked(color, np.uint8)
         height, width = color.shape[:2]
         image = np.empty((1, 3, height, width), np.float32)
         _fill_planes(color, image[0])

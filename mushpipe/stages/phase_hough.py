@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, Literal, Self
 
 import cv2
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 
-from mushpipe import Circles, InputError, Mask, RgbdFrame, Stage
+from mushpipe import Camera, Circles, InputError, Mask, RgbdFrame, Stage
 from mushpipe.core.stage import GraphPath
 from mushpipe.stages.phase_decide import decide
 from mushpipe.stages.phase_depth import NO_RELIEF, Relief, relief_of
@@ -30,6 +30,7 @@ from mushpipe.stages.phase_refit import Table, refit
 from mushpipe.stages.phase_strips import Strips, in_strips
 from mushpipe.stages.phase_verifier import load_verifier
 from mushpipe.stages.phase_votes import CELL, peaks, rings_between, summed, vote
+from mushpipe.stages.warm_up import example_frame
 
 Positive = Annotated[float, Field(gt=0)]
 Bytes = NDArray[np.uint8]
@@ -222,17 +223,14 @@ class PhaseHough(Stage):
         return inside
 
     def _warm_up(self) -> None:
-        v, u = np.mgrid[:96, :96]
-        disc = (u - 48) ** 2 + (v - 48) ** 2 < 400
-        color = np.repeat((40 + 160 * disc).astype(np.uint8)[..., None], 3, axis=2)
-        from mushpipe import Camera, Header
-
-        camera = Camera(96, 96, 100.0, 100.0, 47.5, 47.5)
-        learned = Circles(np.array([[48.0, 48.0]]), np.array([20.0]), np.ones(1))
+        frame = example_frame()
+        height, width = frame.color.shape[:2]
+        camera = Camera(width, height, 100.0, 100.0, width / 2, height / 2)
+        learned = Circles(np.array([[80.0, 64.0]]), np.array([36.0]), np.ones(1))
+        mask = Mask(frame.depth_m < 0.49)
         for native in (np.uint16, np.float32):
-            depth = (500 - 20 * disc).astype(native)
-            frame = RgbdFrame(Header(0, 0, "warm-up"), color, depth, 0.001, camera)
-            self.process(frame, Mask(disc), learned)
+            depth = (1000 * frame.depth_m).astype(native)
+            self.process(replace(frame, depth=depth, camera=camera), mask, learned)
 
 
 def equal_area_radius(shapes: Table) -> Table:

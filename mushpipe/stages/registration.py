@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, PrivateAttr
 
 from mushpipe import (
+    Camera,
     Circles,
     GraphPath,
     InputError,
@@ -76,13 +77,15 @@ class Registration(Stage):
     _model: Any = PrivateAttr(None)
 
     def open(self) -> None:
-        """Load Open3D and the model.
+        """Load Open3D and the model, and compile the kernels.
 
         Raises:
             DependencyError: open3d or a library of the system is missing.
             InputError: The model's file has too few points.
         """
         import_open3d()
+        camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+        upright(self.up, np.full((48, 64), 0.4, np.float32), pixel_rays(camera))
         if self.model in ("mushroom", "cap"):
             self._model = made(self.model == "mushroom", self.voxel)
         else:

@@ -45,7 +45,9 @@ class SurfaceFit(Stage):
         depth = np.full((48, 64), 0.4, np.float32)
         depth.flags.writeable = False  # as a frame's, which to the compiler is a type of its own
         camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
-        fit_tops(depth, camera, np.array([[32.0, 24.0, 9.0]]), (0.001, 0.001), 8)
+        circles = Circles(np.array([[32.0, 24.0]]), np.array([9.0]), np.ones(1))
+        sources(circles, depth)
+        fit_tops(depth, camera, _discs(circles), (0.001, 0.001), 8)
 
     def process(self, frame: RgbdFrame, circles: Circles) -> Locations:
         """Return one location per circle.
@@ -61,7 +63,7 @@ class SurfaceFit(Stage):
                 "camera_info, or set source.camera: {fx: , fy: , cx: , cy: }"
             )
         depth = frame.depth_m
-        discs = np.column_stack([circles.center, circles.radius])
+        discs = _discs(circles)
         noise = (self.depth_noise_mm / 1000, self.depth_noise_per_m / 1000)
         surface, covariance, seen = fit_tops(depth, frame.camera, discs, noise, self.min_points)
         focal = (frame.camera.fx + frame.camera.fy) / 2
@@ -86,6 +88,10 @@ class SurfaceFit(Stage):
             sigma_position=np.column_stack([pixel, pixel, np.sqrt(along)]),
             sigma_diameter=sigma_diameter,
         )
+
+
+def _discs(circles: Circles) -> Floats:
+    return np.column_stack([circles.center, circles.radius])
 
 
 def fit_tops(
