@@ -15,7 +15,7 @@ from mushpipe.core.errors import GraphError, PluginError, Problem, suggest
 from mushpipe.core.overrides import apply_override
 from mushpipe.core.plan import Node, Plan
 from mushpipe.core.plugins import Registry
-from mushpipe.core.stage import Kind, Plugin, ports_of
+from mushpipe.core.stage import WORDS, Kind, Plugin, ports_of, settings_of
 from mushpipe.core.wire import RESULT_PREFIX, TIMING_TOPIC
 from mushpipe.core.wiring import wire
 
@@ -158,7 +158,7 @@ def _node(
     entry: dict[str, Any],
     problems: list[Problem],
 ) -> Node | None:
-    settings = {k: v for k, v in entry.items() if k not in ("use", "inputs", "delivery")}
+    settings = {k: v for k, v in entry.items() if k not in WORDS}
     use, inputs, delivery = entry.get("use"), entry.get("inputs", {}), entry.get("delivery")
     if not isinstance(use, str):
         problems.append(document.problem(at, f"needs 'use': the name of a {kind}", key=True))
@@ -188,13 +188,13 @@ def _node(
             context={"base": document.base.absolute(), "from_shell": document.from_shell(at)},
         )
     except ValidationError as error:
-        problems += _translate(document, at, error, list(_settings(plugin_class)), use)
+        problems += _translate(document, at, error, list(settings_of(plugin_class)), use)
         # never run, but its ports say whether it is wired
         unset = plugin_class.model_construct()
         return Node(str(at[-1]), kind, use, unset, ports, dict(inputs), delivery)
     if ".py:" in use:
         use = str((base / use).resolve())
-    attributes = _settings(plugin_class)
+    attributes = settings_of(plugin_class)
     paths = {
         key: str(value)
         for key, value in settings.items()
@@ -203,16 +203,11 @@ def _node(
     return Node(str(at[-1]), kind, use, plugin, ports, dict(inputs), delivery, paths=paths)
 
 
-def _settings(plugin: type[Plugin]) -> dict[str, str]:
-    """Return the settings' names in a graph file, each with its attribute of the plugin."""
-    return {field.alias or name: name for name, field in plugin.model_fields.items()}
-
-
 def _drop_foreign(
     document: Document, at: Location, use: str, plugin: type[Plugin], settings: dict[str, Any]
 ) -> dict[str, Any]:
     """Drop the settings a swapped-in plugin does not know, unless the command line set them."""
-    foreign = settings.keys() - _settings(plugin).keys() - document.from_shell(at)
+    foreign = settings.keys() - settings_of(plugin).keys() - document.from_shell(at)
     for key in sorted(foreign):
         document.warnings.append(f"{at[-1]}: '{use}' has no setting '{key}'; it is dropped")
     return {key: value for key, value in settings.items() if key not in foreign}

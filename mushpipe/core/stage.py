@@ -21,6 +21,8 @@ from mushpipe.core.truth import BUILT_IN
 from mushpipe.core.types import Mask, RgbdFrame
 
 Kind = Literal["stage", "source", "sink"]
+WORDS = ("use", "inputs", "delivery")
+"""What stands beside the settings of a node in a graph."""
 # Values are recorded under the names of their types.
 _TAKEN: dict[str, type] = {t.__name__: t for t in (*BUILT_IN, Mask, RgbdFrame)}
 _METHODS: dict[Kind, str] = {"stage": "process", "source": "frames", "sink": "consume"}
@@ -215,12 +217,24 @@ def kind_of(plugin: type) -> Kind:
     raise PluginError(f"{plugin!r} is not a Stage, Source or Sink class")
 
 
+def settings_of(plugin: type[Plugin]) -> dict[str, str]:
+    """Return the settings' names in a graph file, each with its attribute of the plugin."""
+    return {field.alias or name: name for name, field in plugin.model_fields.items()}
+
+
 def ports_of(plugin: type[Plugin]) -> Ports:
     """Read the ports of a plugin class from the annotations of its method.
 
     Raises:
-        PluginError: The method is missing, or an annotation is missing or not a class.
+        PluginError: The method is missing, an annotation is missing or not a class, or a setting
+            has a name that a graph could not set.
     """
+    for name in settings_of(plugin):
+        if name in WORDS:
+            raise PluginError(
+                f"{plugin.__qualname__}: a setting cannot be called '{name}', which in a graph "
+                "stands beside the settings; give it another name, or an alias"
+            )
     if kind_of(plugin) == "source":
         return Ports((), (RgbdFrame,), False)
     name = _METHODS[kind_of(plugin)]

@@ -93,6 +93,20 @@ def test_a_signature_that_says_too_little(lab: Lab, process, message):
     assert fault.startswith(f"graph.yaml:4:12: {message}")
 
 
+@pytest.mark.parametrize("word", ["use", "inputs", "delivery"])
+def test_a_setting_that_a_graph_could_not_set(lab: Lab, word: str):
+    class Greedy(Stage):
+        __annotations__ = {word: str}
+
+        def process(self, frame: RgbdFrame) -> Mask:
+            raise NotImplementedError
+
+    lab.registry.stage("greedy", Greedy)
+    fault = lab.faults("mushpipe: 1\nsource: {use: frames}\nstages:\n  a: {use: greedy}\n")
+    assert fault.startswith("graph.yaml:4:12: ")
+    assert f"Greedy: a setting cannot be called '{word}', which in a graph stands" in fault
+
+
 def test_a_plugin_without_its_method():
     with pytest.raises(PluginError, match=r"^Stage has no method 'process'$"):
         ports_of(Stage)
