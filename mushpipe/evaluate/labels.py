@@ -123,10 +123,10 @@ def convert(document: Json) -> Json:
 def _must_find(document: Json) -> list[Json]:
     caps = []
     for item in document["must_find"]:
-        first, second = item["ellipse_px"][:2]
+        first, second = map(_number, item["ellipse_px"][:2])
         cap = {"u": item["cx"], "v": item["cy"], "radius_px": math.sqrt(first * second) / 2}
         if "diam_silhouette" in item:
-            cap["diameter_m"] = item["diam_silhouette"] / 1000
+            cap["diameter_m"] = _number(item["diam_silhouette"]) / 1000
         caps.append(cap)
     may_find = [
         {"u": item["cx"], "v": item["cy"], "radius_px": item["r"]}
@@ -150,13 +150,19 @@ def _boxes(document: Json) -> list[Json]:
 
 
 def _box(cap: Json) -> Json:
-    x, y, width, height = cap["bbox"]
+    x, y, width, height = map(_number, cap["bbox"])
     return {
         "u": x + (width - 1) / 2,
         "v": y + (height - 1) / 2,
         "radius_px": math.sqrt(width * height) / 2,
-        "ignore": "at-border" if cap.get("near_border") else False,
+        "ignore": "at-border" if cap.get("near_border") else cap.get("ignore", False),
     }
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"expected a number, got {value!r}")
+    return value
 
 
 def truth_of(caps: list[Cap]) -> Truth:

@@ -89,14 +89,18 @@ def test_circles_with_ignore(tmp_path: Path) -> None:
 
 
 def test_boxes(tmp_path: Path) -> None:
-    caps = [{"bbox": [100, 200, 41, 41]}, {"bbox": [0, 0, 90, 40], "near_border": True}]
+    caps = [
+        {"bbox": [100, 200, 41, 41]},
+        {"bbox": [0, 0, 90, 40], "near_border": True},
+        {"bbox": [50, 50, 9, 9], "ignore": True},
+    ]
     frames = [{"stamp_ns": 1, "caps": []}, {"stamp_ns": 2, "caps": caps}]
     truth = read_truth(written(tmp_path, {"frames": frames}))
     assert len(truth.frames["stamp_ns", 1].caps) == 0
     found = truth.frames["stamp_ns", 2].caps
     assert found.center[0].tolist() == [120, 220]
-    assert found.radius.tolist() == pytest.approx([20.5, 30])
-    assert found.ignore.tolist() == [Ignore.COUNTS, Ignore.AT_BORDER]
+    assert found.radius.tolist() == pytest.approx([20.5, 30, 4.5])
+    assert found.ignore.tolist() == [Ignore.COUNTS, Ignore.AT_BORDER, Ignore.AMBIGUOUS]
 
 
 def test_conversion_leaves_the_own_format_alone() -> None:
@@ -135,6 +139,14 @@ def test_conversion_leaves_the_own_format_alone() -> None:
             "an axis needs a length",
         ),
         ({"stamp_ns": 1, "caps": [5]}, "labels with 'caps'"),
+        (
+            {"frames": [{"stamp_ns": 1, "caps": [{"bbox": [True, 2, 3, 4]}]}]},
+            "labels with 'frames'.*expected a number, got True",
+        ),
+        (
+            {"must_find": [{"cx": 1, "cy": 2, "ellipse_px": ["40", 90, 0]}]},
+            "labels with 'must_find'.*expected a number, got '40'",
+        ),
         ({"stamp_ns": "1", "caps": []}, "frames.0.stamp_ns"),
         ({"stamp_ns": 1, "caps": [{"u": True, "v": 1, "radius_px": 1}]}, "frames.0.caps.0.u"),
         ({"stamp_ns": 1, "caps": [{"u": 1, "v": "1", "radius_px": 1}]}, "frames.0.caps.0.v"),
