@@ -33,8 +33,8 @@ def paint(ranks: NDArray[np.int16], circles: Floats, order: NDArray[np.int64]) -
             half = np.sqrt(max(r * r - (v - y) ** 2, 0.0))
             # of every row the same columns: loops of one length are foreseen by the processor
             row = ranks[v, first:beyond]
-            left = np.int16(max(np.ceil(x - half) - first, 0.0))
-            right = np.int16(min(np.floor(x + half) - first, WIDE))
+            left = np.int16(min(max(np.ceil(x - half) - first, 0.0), WIDE))
+            right = np.int16(max(min(np.floor(x + half) - first, WIDE), -1.0))
             for j in range(beyond - first):
                 column = np.int16(j)
                 row[j] = value if (left <= column) & (column <= right) else row[j]
