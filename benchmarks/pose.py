@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pose_scenes import frames, true_circles
 
-from mushpipe import Circles
+from mushpipe import Circles, DepthSource
 from mushpipe.core.libraries import import_open3d
+from mushpipe.stages.cap_attempt import ODD
 from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.depth_correct import DepthCorrect
 from mushpipe.stages.fuse_depth import FuseDepth
@@ -27,10 +28,8 @@ from mushpipe.stages.registration import Registration
 
 SCENE = {"distance": 0.65, "size_mm": (20, 50), "tilt_deg": (0, 25), "count": 240, "cluster": 0.5}
 SEED = 7
+ROUNDS = 8  # in which the calls take turns
 Floats = NDArray[np.float64]
-
-
-ROUNDS = 8
 
 
 def milliseconds(calls: dict[str, tuple[Callable[[], object], int]]) -> dict[str, Floats]:
@@ -71,6 +70,9 @@ def main() -> None:
         f"Python {platform.python_version()}, numba {numba.__version__}, "
         f"open3d {import_open3d().__version__}, OMP_NUM_THREADS={os.environ.get('OMP_NUM_THREADS')}"
     )
+    fits, measured = fit.fit(frame.gray, frame.depth_m, frame.camera, circles), DepthSource.MEASURED
+    holes = np.count_nonzero(fit.process(frame, circles)[0].source != measured)
+    print(f"{holes} have a hole at the centre, {np.count_nonzero(fits.misfit > ODD)} fit poorly")
     fuse = FuseDepth()
     fuse.open()
     spread = np.linspace(0, len(circles) - 1, options.registrations).astype(int)

@@ -64,8 +64,14 @@ class Columns:
         """Raise ValueError where values contradict each other; overridden by each type."""
 
     @classmethod
+    @cache
     def _columns(cls) -> dict[str, tuple[tuple[int, ...], np.dtype[Any]]]:
-        return _columns_of(cls)  # type: ignore[arg-type]  # a class is hashable
+        """Return the shape of a row and the dtype of each column."""
+        return {
+            item.name: (item.metadata["shape"], np.dtype(item.metadata["dtype"]))
+            for item in fields(cls)  # type: ignore[arg-type]
+            if "shape" in item.metadata
+        }
 
     @classmethod
     def unknown(cls, n: int, **known: Any) -> Self:
@@ -88,16 +94,6 @@ class Columns:
         if not condition.all():
             row = np.argwhere(~condition)[0, 0]
             raise ValueError(f"{type(self).__name__}: {text} (row {row})")
-
-
-@cache
-def _columns_of(kind: type[Columns]) -> dict[str, tuple[tuple[int, ...], np.dtype[Any]]]:
-    """Return the shape of a row and the dtype of each column of a type."""
-    return {
-        item.name: (item.metadata["shape"], np.dtype(item.metadata["dtype"]))
-        for item in fields(kind)  # type: ignore[arg-type]
-        if "shape" in item.metadata
-    }
 
 
 class DepthSource(IntEnum):

@@ -141,8 +141,8 @@ def fit_all(
             variances[i] = counts[i, 7]
     spread_of(squares, variances, upright[1], spreads)
     for i in range(n):
-        improved[i] = circles[i]
         if counts[i, 0] > 0:
+            improved[i] = circles[i]
             fit, own = Fit(rays[i], caps[i], counts[i]), (upright[0], spreads[i])
             second_fit(frame, improved[i], own, settings, fit, covariances[i], told[i], room)
         if not counts[i, 0] > 0:

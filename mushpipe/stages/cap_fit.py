@@ -22,8 +22,10 @@ from mushpipe.stages.cap_batch import Fits, fit_caps
 from mushpipe.stages.cap_order import Order, by_depth
 from mushpipe.stages.cap_solve import Noise
 from mushpipe.stages.cap_verify import chances
+from mushpipe.stages.discs import discs_of
 from mushpipe.stages.surface_fit import fit_tops, sources, variance_along, without_tip
 from mushpipe.stages.upright import Up, pixel_rays, upright
+from mushpipe.stages.warm_up import example_circles, example_frame
 
 Floats = NDArray[np.float64]
 LEAST = 8  # points that a surface over a hole needs
@@ -67,17 +69,7 @@ class CapFit(Stage):
 
     def open(self) -> None:
         """Compile the kernels, and read the verifier if it is asked."""
-        camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
-        circles = Circles(np.array([[32.0, 24.0]]), np.array([9.0]), np.ones(1))
-        gray, depth = np.zeros((48, 64), np.float32), np.full((48, 64), 0.4, np.float32)
-        # arrays of a frame are read-only, which to the compiler is a type of its own
-        gray.flags.writeable = depth.flags.writeable = False
-        order = by_depth(depth, _discs(circles))
-        fits = self.fit(gray, depth, camera, circles, order)
-        sources(circles, depth)
-        self._bridge(np.arange(1), fits, depth, camera, circles, order)
-        if self.min_score is not None:
-            chances(circles, fits)
+        self.process(example_frame(), example_circles())
 
     def process(self, frame: RgbdFrame, circles: Circles) -> tuple[Locations, Poses, Circles]:
         """Return one location and one pose per circle, and the circles, improved.
@@ -93,7 +85,7 @@ class CapFit(Stage):
                 "camera_info, or set source.camera: {fx: , fy: , cx: , cy: }"
             )
         depth = frame.depth_m
-        order = by_depth(depth, _discs(circles))
+        order = by_depth(depth, discs_of(circles))
         fits = self.fit(frame.gray, depth, frame.camera, circles, order)
         score = circles.score if self.min_score is None else chances(circles, fits)
         circles = Circles(fits.circle[:, :2], fits.circle[:, 2], score)
@@ -128,7 +120,7 @@ class CapFit(Stage):
             circles: Outlines, px.
             order: From `by_depth`, if that is known.
         """
-        rays, discs = pixel_rays(camera), _discs(circles)
+        rays, discs = pixel_rays(camera), discs_of(circles)
         noise = Noise(
             shape=0.027,
             outline=0.03,
@@ -164,7 +156,7 @@ class CapFit(Stage):
         order: Order,
     ) -> None:
         """Put the surface over holes at a centre, as `surface-fit` does: spheroids have no tip."""
-        discs = _discs(circles)
+        discs = discs_of(circles)
         noise = (self.depth_noise_mm / 1000, self.depth_noise_per_m / 1000)
         surface, covariance, _ = fit_tops(depth, camera, discs, noise, LEAST, holes, order)
         fitted = np.isfinite(surface[:, 0])
@@ -176,10 +168,6 @@ class CapFit(Stage):
         along = variance_along(without_tip(*tops)[0], tops[1], size, pixel)
         fits.surface[rows] = camera.deproject(discs[:, :2], z)
         fits.sigma_surface[rows, 2] = np.maximum(fits.sigma_surface[rows, 2], np.sqrt(along))
-
-
-def _discs(circles: Circles) -> Floats:
-    return np.column_stack([circles.center, circles.radius])
 
 
 def _locations(fits: Fits, source: NDArray[np.uint8]) -> Locations:

@@ -99,6 +99,31 @@ def sample_depth(
 
 
 @borrower
+def look_around(
+    window: Window, own: Singles, at: tuple[float, float], far: float, state: Singles,
+    pixels: NDArray[np.int32],
+) -> None:  # fmt: skip
+    """Put the depth in each direction into the last row of `state`, 0 outside of the window.
+
+    Args:
+        window: From `own_depth`.
+        own: (H W,) its depth.
+        at: x and y to look from, half a pixel added, in the window.
+        far: Distance, px.
+        state: As in `follow`.
+        pixels: (DIRECTIONS or more,) room.
+    """
+    width, height, none = np.int32(window.width), np.int32(window.height), Single(0)
+    for j in range(DIRECTIONS):
+        u, v = np.int32(np.floor(at[0] + far * EAST[j])), np.int32(np.floor(at[1] + far * SOUTH[j]))
+        inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+        pixels[j] = v * width + u if inside else -1
+    for j in range(DIRECTIONS):
+        z = own[max(pixels[j], 0)]
+        state[j + 5 * DIRECTIONS] = z if pixels[j] >= 0 else none
+
+
+@borrower
 def follow(
     window: Window,
     own: Singles,
@@ -125,23 +150,15 @@ def follow(
             once.
         pixels: (DIRECTIONS or more,) room.
     """
-    width, height = np.int32(window.width), np.int32(window.height)
     none, one, low, high = Single(0), Single(1), Single(gate[0]), Single(gate[1])
     half, little, four = Single(0.5), Single(0.15), Single(4)
-    x, y = Single(circle[0] - window.left + 0.5), Single(circle[1] - window.top + 0.5)
+    at = (Single(circle[0] - window.left + 0.5), Single(circle[1] - window.top + 0.5))
     for j in range(DIRECTIONS):
         state[j], state[j + DIRECTIONS], state[j + 2 * DIRECTIONS] = one, none, none
         state[j + 3 * DIRECTIONS], state[j + 4 * DIRECTIONS] = -one, none
     for k in range(RADII):
-        far, step = Single(circle[2] * (INNER + k * STEP)), Single(k)
-        for j in range(DIRECTIONS):
-            u, v = np.int32(np.floor(x + far * EAST[j])), np.int32(np.floor(y + far * SOUTH[j]))
-            inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
-            pixels[j] = v * width + u if inside else -1
-        for j in range(DIRECTIONS):
-            z = own[max(pixels[j], 0)]
-            state[j + 5 * DIRECTIONS] = z if pixels[j] >= 0 else none
-        going = none
+        step, going = Single(k), none
+        look_around(window, own, at, Single(circle[2] * (INNER + k * STEP)), state, pixels)
         for j in range(DIRECTIONS):
             on, total = state[j] > none, state[j + DIRECTIONS]
             best, edge = state[j + 2 * DIRECTIONS], state[j + 3 * DIRECTIONS]

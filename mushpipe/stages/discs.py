@@ -1,10 +1,19 @@
-"""What two circles share, as kernels of other stages ask for it, pair by pair."""
+"""Circles as kernels take them, and what two of them share."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
+from numpy.typing import NDArray
+
 from mushpipe.core.jit import borrower
+from mushpipe.core.tables import Circles
+
+
+def discs_of(circles: Circles) -> NDArray[np.float64]:
+    """Return x, y and radius (N, 3), px."""
+    return np.column_stack([circles.center, circles.radius])
 
 
 @borrower

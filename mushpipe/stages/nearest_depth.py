@@ -7,7 +7,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mushpipe import Circles, DepthSource, InputError, Locations, RgbdFrame, Stage
+from mushpipe.core.geometry import lengths
 from mushpipe.core.jit import jit
+from mushpipe.stages.discs import discs_of
+from mushpipe.stages.warm_up import example_circles, example_frame
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -27,10 +30,7 @@ class NearestDepth(Stage):
 
     def open(self) -> None:
         """Compile the kernels."""
-        depth = np.zeros((2, 2), np.float32)
-        depth.flags.writeable = False
-        nearest(depth, np.zeros((1, 3)), 1, np.empty((1, 1, 3)))
-        ends(depth, np.zeros((1, 3)), np.empty((1, 4)))
+        self.process(example_frame(), example_circles())
 
     def process(self, frame: RgbdFrame, circles: Circles) -> Locations:
         """Return one location per circle.
@@ -49,7 +49,7 @@ class NearestDepth(Stage):
                 )
             depth = np.fmax(frame.depth_m, np.float32(0))  # missing: 0 in place of NaN
             depth.flags.writeable = False
-            discs = np.column_stack([circles.center, circles.radius])
+            discs = discs_of(circles)
             pixels = np.full((n, self.neighbours, 3), np.nan)
             found = nearest(depth, discs, self.neighbours, pixels)
             points = frame.camera.deproject(pixels[..., :2], pixels[..., 2])
@@ -72,7 +72,7 @@ class NearestDepth(Stage):
             diameter[~known.any(axis=1)] = np.nan
         return Locations(
             position=position,
-            distance=np.linalg.norm(position, axis=1),
+            distance=lengths(position),
             diameter=diameter,
             source=source,
             sigma_position=np.full((n, 3), np.nan),

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 
-from mushpipe import Camera, Circles, InputError, Mask, RgbdFrame, Stage
+from mushpipe import Circles, InputError, Mask, RgbdFrame, Stage
 from mushpipe.core.stage import GraphPath
 from mushpipe.stages.phase_decide import decide
 from mushpipe.stages.phase_depth import NO_RELIEF, Relief, relief_of
@@ -30,7 +30,7 @@ from mushpipe.stages.phase_refit import Table, refit
 from mushpipe.stages.phase_strips import Strips, in_strips
 from mushpipe.stages.phase_verifier import load_verifier
 from mushpipe.stages.phase_votes import CELL, peaks, rings_between, summed, vote
-from mushpipe.stages.warm_up import example_frame
+from mushpipe.stages.warm_up import example_circles, example_frame
 
 Positive = Annotated[float, Field(gt=0)]
 Bytes = NDArray[np.uint8]
@@ -224,13 +224,10 @@ class PhaseHough(Stage):
 
     def _warm_up(self) -> None:
         frame = example_frame()
-        height, width = frame.color.shape[:2]
-        camera = Camera(width, height, 100.0, 100.0, width / 2, height / 2)
-        learned = Circles(np.array([[80.0, 64.0]]), np.array([36.0]), np.ones(1))
         mask = Mask(frame.depth_m < 0.49)
         for native in (np.uint16, np.float32):
             depth = (1000 * frame.depth_m).astype(native)
-            self.process(replace(frame, depth=depth, camera=camera), mask, learned)
+            self.process(replace(frame, depth=depth), mask, example_circles())
 
 
 def equal_area_radius(shapes: Table) -> Table:

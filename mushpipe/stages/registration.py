@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, PrivateAttr
 
 from mushpipe import (
-    Camera,
     Circles,
     GraphPath,
     InputError,
@@ -23,6 +22,7 @@ from mushpipe import (
 from mushpipe.core.libraries import import_open3d
 from mushpipe.stages.upright import Up, pixel_rays, upright
 from mushpipe.stages.upright_model import Model, made, read
+from mushpipe.stages.warm_up import CAMERA, example_frame
 
 Floats = NDArray[np.float64]
 
@@ -84,8 +84,7 @@ class Registration(Stage):
             InputError: The model's file has too few points.
         """
         import_open3d()
-        camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
-        upright(self.up, np.full((48, 64), 0.4, np.float32), pixel_rays(camera))
+        upright(self.up, np.fmax(example_frame().depth_m, np.float32(0)), pixel_rays(CAMERA))
         if self.model in ("mushroom", "cap"):
             self._model = made(self.model == "mushroom", self.voxel)
         else:

@@ -7,12 +7,15 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mushpipe import Camera, Circles, DepthSource, InputError, Locations, RgbdFrame, Stage
+from mushpipe.core.geometry import lengths
 from mushpipe.core.jit import borrower
 from mushpipe.stages.cap_blocks import CELLS
 from mushpipe.stages.cap_order import Order, by_depth
 from mushpipe.stages.cap_samples import ASTRAY
+from mushpipe.stages.discs import discs_of
 from mushpipe.stages.paraboloid import ASPECT, COEFFICIENTS, SHAPE_M, TIP, fit_surfaces
 from mushpipe.stages.upright import pixel_rays
+from mushpipe.stages.warm_up import example_circles, example_frame
 
 Floats = NDArray[np.float64]
 ASPECT_SIGMA = 0.2  # as in cap-fit
@@ -42,12 +45,7 @@ class SurfaceFit(Stage):
 
     def open(self) -> None:
         """Compile the kernels."""
-        depth = np.full((48, 64), 0.4, np.float32)
-        depth.flags.writeable = False  # as a frame's, which to the compiler is a type of its own
-        camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
-        circles = Circles(np.array([[32.0, 24.0]]), np.array([9.0]), np.ones(1))
-        sources(circles, depth)
-        fit_tops(depth, camera, _discs(circles), (0.001, 0.001), 8)
+        self.process(example_frame(), example_circles())
 
     def process(self, frame: RgbdFrame, circles: Circles) -> Locations:
         """Return one location per circle.
@@ -63,7 +61,7 @@ class SurfaceFit(Stage):
                 "camera_info, or set source.camera: {fx: , fy: , cx: , cy: }"
             )
         depth = frame.depth_m
-        discs = _discs(circles)
+        discs = discs_of(circles)
         noise = (self.depth_noise_mm / 1000, self.depth_noise_per_m / 1000)
         surface, covariance, seen = fit_tops(depth, frame.camera, discs, noise, self.min_points)
         focal = (frame.camera.fx + frame.camera.fy) / 2
@@ -82,16 +80,12 @@ class SurfaceFit(Stage):
         known = np.isfinite(position).all(axis=1)
         return Locations(
             position=position,
-            distance=np.linalg.norm(position, axis=1),
+            distance=lengths(position),
             diameter=diameter,
             source=np.where(known, sources(circles, depth), DepthSource.MISSING),
             sigma_position=np.column_stack([pixel, pixel, np.sqrt(along)]),
             sigma_diameter=sigma_diameter,
         )
-
-
-def _discs(circles: Circles) -> Floats:
-    return np.column_stack([circles.center, circles.radius])
 
 
 def fit_tops(

@@ -9,6 +9,7 @@ from scipy.spatial.distance import cdist
 from mushpipe.core.jit import jit
 from mushpipe.core.tables import Circles, Floats, Locations
 from mushpipe.stages.cap_order import paint
+from mushpipe.stages.discs import discs_of
 
 
 def hidden_share(circles: Circles, distance: Floats, image: tuple[int, int]) -> Floats:
@@ -23,7 +24,7 @@ def hidden_share(circles: Circles, distance: Floats, image: tuple[int, int]) -> 
     order = np.argsort(np.nan_to_num(distance, nan=np.inf), kind="stable")
     rank = np.empty(n, np.int64)
     rank[order] = np.arange(n)
-    discs = np.column_stack([circles.center, circles.radius])
+    discs = discs_of(circles)
     ranks = np.full(image[::-1], n, np.int16)
     paint(ranks, discs, order)
     return covered(ranks, discs, rank)
