@@ -96,6 +96,7 @@ class Relief:
 
     Attributes:
         height: (h, w) m over the bed at half resolution, -1 where unknown.
+        filled: (h, w) m, the same with narrow gaps `closed`.
         depth: (h, w) m, -1 where unknown.
         focal: px of the full image.
         pixel: Size of a pixel of the full image on the bed, m.
@@ -103,18 +104,18 @@ class Relief:
 
     def __init__(self, depth: Plane, height: Plane, focal: float) -> None:
         self.depth, self.height, self.focal = depth, height, focal
+        self.filled = closed(height)
         known = depth[depth > 0]
         self.pixel = float(np.median(known[:: max(1, len(known) // 2000)])) / focal
 
     def edges(self) -> Edges:
         """Return the depth discontinuities, in px of the height map."""
-        filled = closed(self.height)
-        known = np.maximum(filled, 0)
+        known = np.maximum(self.filled, 0)
         edges = depth_edges(known, STEEP * CELL * self.pixel)
         # Where depth ends, nothing is known to lie lower.
         u = np.rint(edges.x - 2.5 * edges.nx).astype(int).clip(0, known.shape[1] - 1)
         v = np.rint(edges.y - 2.5 * edges.ny).astype(int).clip(0, known.shape[0] - 1)
-        real = filled[v, u] != -1
+        real = self.filled[v, u] != -1
         return Edges(*(column[real] for column in edges))
 
 

@@ -12,6 +12,7 @@ from pydantic import Field, PrivateAttr, model_validator
 
 from mushpipe import Circles, InputError, Mask, RgbdFrame, Stage
 from mushpipe.core.stage import GraphPath
+from mushpipe.stages.phase_blobs import blobs_of
 from mushpipe.stages.phase_decide import decide
 from mushpipe.stages.phase_depth import NO_RELIEF, Relief, relief_of
 from mushpipe.stages.phase_edges import (
@@ -96,6 +97,9 @@ class PhaseHough(Stage):
         0.07, ge=0.01, le=1, description="least share of an outline that votes, for a candidate"
     )
     use_depth: bool = Field(True, description="false ignores depth")
+    use_blobs: bool = Field(
+        True, description="take what stands free on the bed as candidates, where there is depth"
+    )
     use_learned: bool = Field(
         False, description="take the circles of the `cap-net` above: as candidates, and as evidence"
     )
@@ -168,6 +172,8 @@ class PhaseHough(Stage):
         found = peaks(*summed(cells), self.evidence, smallest, largest, _REACH)
         if learned is not None:
             found = np.concatenate([found, candidates_of(learned, smallest, largest)])
+        if relief is not None and self.use_blobs:
+            found = np.concatenate([found, blobs_of(relief, smallest, largest)])
         high, pixel = (relief.height, relief.pixel) if relief else (NO_RELIEF, 0.0)
         shapes, hits, residual = refit(edges, high, pixel, found, smallest, largest)
         table, middle = static_features(

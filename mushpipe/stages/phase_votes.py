@@ -102,7 +102,8 @@ def summed(cells: NDArray[np.float32]) -> tuple[NDArray[np.float32], Plane]:
 
 
 @borrower
-def _highest_around(size: Plane, x: int, y: int, reach: int) -> bool:
+def highest_around(size: Plane, x: int, y: int, reach: int) -> bool:
+    """Whether no value within `reach` is higher; of equal ones the first row, then column, is."""
     value = size[y, x]
     for v in range(max(y - reach, 0), min(y + reach + 1, size.shape[0])):
         for u in range(max(x - reach, 0), min(x + reach + 1, size.shape[1])):
@@ -136,7 +137,7 @@ def peaks(
     log_range = math.log(max(largest / smallest, 1.001))
     for y in range(1, height - 1):
         for x in range(1, width - 1):
-            if size[y, x] < least or not _highest_around(size, x, y, reach):
+            if size[y, x] < least or not highest_around(size, x, y, reach):
                 continue
             u = x + _vertex(size[y, x - 1], size[y, x], size[y, x + 1])
             v = y + _vertex(size[y - 1, x], size[y, x], size[y + 1, x])

@@ -1,0 +1,71 @@
+"""Candidates from depth alone: the largest discs that fit into what stands on the bed.
+
+Where an image has no contrast, wood on wood or in dim light, too few edges vote for a cap's centre,
+or none hold an outline that starts beside it. Its depth shows it all the same: of all that is
+higher than a level, the centres of the largest discs within it are the peaks of its distance
+transform (Blum 1967). Several levels part a cap from its stem and from what it touches.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+
+from mushpipe.core.jit import borrower, jit
+from mushpipe.stages.phase_depth import CELL, Relief
+from mushpipe.stages.phase_edges import Plane
+from mushpipe.stages.phase_votes import highest_around
+
+LEVELS = (0.01, 0.02, 0.035)  # m over the bed
+STEP = 2  # px of the height map; a start for a refit need not be more exact
+REACH = 2  # steps around a peak within which it must be the highest
+FREE = 0.55  # share of the ring around a disc that is lower, for it to be a thing of its own
+RING = 1.25  # radius of that ring, of the disc's
+_TURNS = 2 * np.pi * np.arange(16) / 16
+_COSINES, _SINES = np.cos(_TURNS), np.sin(_TURNS)
+
+
+def blobs_of(relief: Relief, smallest: float, largest: float) -> Plane:
+    """Return the discs of a radius (px) in the range that stand free, as candidates (N, 4)."""
+    height, pixel = relief.filled[::STEP, ::STEP], CELL * STEP
+    found = [np.zeros((0, 4), np.float32)]
+    for level in LEVELS:
+        standing = (height > level).astype(np.uint8)
+        away = cv2.distanceTransform(standing, cv2.DIST_L2, cv2.DIST_MASK_5)
+        limits = (0.9 * smallest / pixel, 1.1 * largest / pixel)
+        found.append(_discs(np.asarray(away, np.float32), pixel, limits))
+    return np.concatenate(found)
+
+
+@jit
+def _discs(away: Plane, pixel: int, limits: tuple[float, float]) -> Plane:
+    height, width = away.shape
+    found, count = np.empty((away.size // 4 + 1, 4), np.float32), 0
+    for v in range(height):
+        for u in range(width):
+            r = away[v, u]
+            if r < limits[0] or r > limits[1] or not highest_around(away, u, v, REACH):
+                continue
+            x, y = pixel * (u + 0.5) - 0.5, pixel * (v + 0.5) - 0.5
+            if _free(away, u, v):
+                found[count, 0], found[count, 1], found[count, 2] = x, y, pixel * r
+                found[count, 3] = 1.0
+                count += 1
+    return found[:count]
+
+
+@borrower
+def _free(away: Plane, u: int, v: int) -> bool:
+    """Whether what is around a disc, as far as it lies in the image, is mostly lower."""
+    height, width = away.shape
+    inside = lower = 0
+    for k in range(len(_COSINES)):
+        x = math.floor(u + RING * away[v, u] * _COSINES[k] + 0.5)
+        y = math.floor(v + RING * away[v, u] * _SINES[k] + 0.5)
+        if x < 0 or y < 0 or x >= width or y >= height:
+            continue
+        inside += 1
+        lower += away[y, x] == 0
+    return lower >= FREE * inside and 2 * inside >= len(_COSINES)
