@@ -55,8 +55,7 @@ class DepthCorrect(Stage):
         if self.calibration is not None:
             self._errors = self._read(self.calibration)
         for native in (np.uint16, np.float32):
-            frame = example_frame()
-            self.process(replace(frame, depth=frame.depth_m.astype(native)))
+            self.process(example_frame(native=native))
 
     def _read(self, path: Path) -> tuple[float, float, float]:
         try:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, Self
 
 import cv2
@@ -229,11 +229,9 @@ class PhaseHough(Stage):
         return inside
 
     def _warm_up(self) -> None:
-        frame = example_frame()
-        mask = Mask(frame.depth_m < 0.49)
         for native in (np.uint16, np.float32):
-            depth = (1000 * frame.depth_m).astype(native)
-            self.process(replace(frame, depth=depth), mask, example_circles())
+            frame = example_frame(native=native)
+            self.process(frame, Mask(frame.depth_m < 0.49), example_circles())
 
 
 def equal_area_radius(shapes: Table) -> Table:

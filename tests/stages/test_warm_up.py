@@ -69,6 +69,14 @@ def test_no_frame_waits_for_a_compiler(graph: str, recording: str, tmp_path: Pat
         text = text.replace("../recordings/first-bed.mcap", str(played))
         text = text.replace("../out", str(tmp_path))
     (tmp_path / "graph.yaml").write_text(text)
-    command = [sys.executable, "-c", SCRIPT, str(tmp_path / "graph.yaml")]
+    # a warning of NumPy's while a stage opens would be in the face of every user
+    command = [
+        sys.executable,
+        "-W",
+        "error::RuntimeWarning",
+        "-c",
+        SCRIPT,
+        str(tmp_path / "graph.yaml"),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=400)
     assert done.returncode == 0, done.stderr
