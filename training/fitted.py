@@ -19,10 +19,10 @@ from mushpipe.evaluate.matching import circle_iou
 from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.cap_verify import MODEL, NAMES, features
 from mushpipe.stages.phase_hough import PhaseHough
+from training.harder import harder
 from training.matching import counted, matched
 from training.net.scenes import varied_cases
 from training.scenes import training_cases
-from training.sensors import worse
 from training.verifier import NET, RADII, VARIED, Floats, fit, segmentations, write
 
 LEAST = 0.1  # score
@@ -56,7 +56,7 @@ def samples(cache: Path) -> tuple[Floats, Floats]:
     stage, rng = CapFit(), np.random.default_rng(7)
     rows, right = [], []
     for case in chain(training_cases(cache), varied_cases(cache, "a", VARIED)):
-        for frame in (case.frame, worse(case.frame, rng)):
+        for frame in (case.frame, harder(case, rng).frame):
             if frame.camera is None or frame.depth is None:
                 continue
             for circles in detected(frame):

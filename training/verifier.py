@@ -34,6 +34,7 @@ from mushpipe.stages.phase_features import (
 )
 from mushpipe.stages.phase_hough import PhaseHough, equal_area_radius
 from mushpipe.stages.verifier import COLUMNS, LIMIT
+from training.harder import harder, stained
 from training.matching import IOU
 from training.net.scenes import varied_cases
 from training.scenes import Case, training_cases
@@ -86,15 +87,19 @@ def prepared(cache: Path) -> Iterator[Prepared]:
 
     Beside `cap-net` its mask takes the place of a segmentation. What is learnt there is learnt on
     varied frames as well, as that is what it is for. A network is surer of frames like those it was
-    trained on than of any others, so each frame comes a second time with a `doubtful` one.
+    trained on than of any others, so each frame comes a second time with a `doubtful` one. And as
+    real caps are not as clean as simulated ones, all of that comes once more on a `stained` frame
+    and on a `harder` one.
     """
-    rng = np.random.default_rng(0)
-    for case in training_cases(cache):
-        for frame, mask in segmentations(case.frame):
-            yield case, frame, mask, None
-        yield from _beside(case, rng)
-    for case in varied_cases(cache, "a", VARIED):
-        yield from _beside(case, rng)
+    rng, other = np.random.default_rng(0), np.random.default_rng(1)
+    for clean in training_cases(cache):
+        for case in (clean, stained(clean, other), harder(clean, other)):
+            for frame, mask in segmentations(case.frame):
+                yield case, frame, mask, None
+            yield from _beside(case, rng)
+    for clean in varied_cases(cache, "a", VARIED):
+        for case in (clean, stained(clean, other), harder(clean, other)):
+            yield from _beside(case, rng)
 
 
 def _beside(case: Case, rng: np.random.Generator) -> Iterator[Prepared]:

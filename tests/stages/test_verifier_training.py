@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 
 from mushpipe import Circles
-from mushpipe.core.truth import TRUTH_TOPIC
+from mushpipe.core.truth import INSTANCES_TOPIC, TRUTH_TOPIC
 from tests.stages.frames import simulated
 from training.fitted import labels
+from training.harder import harder
 from training.matching import counted
+from training.net.scenes import cap_mask
+from training.scenes import Case
 from training.sensors import worse
 from training.verifier import NET, RADII, doubtful, fit
 
@@ -50,6 +53,24 @@ def test_a_worse_camera_sees_less_and_noisier_depth_where_there_was_some() -> No
         assert np.isfinite(bad.depth_m).mean() < np.isfinite(seen).mean()
         off = np.abs(bad.depth_m - seen)
         assert 0 < np.nanmedian(off) < 0.005
+
+
+def test_a_harder_frame_has_blotches_on_its_caps_and_at_times_on_its_bed_and_worse_depth() -> None:
+    frame = simulated(6, width=320, height=240)
+    truth, rng = frame.attached[TRUTH_TOPIC], np.random.default_rng(0)
+    cap = cap_mask(truth, frame.attached[INSTANCES_TOPIC])
+    caps, beds = [], []
+    for _ in range(8):
+        hard = harder(Case("even", "a", 6, frame, truth), rng)
+        changed = np.ptp(hard.frame.color.astype(int) - frame.color, axis=2) > 0
+        caps.append(changed[cap].mean())
+        beds.append(changed[~cap].mean())
+        assert np.isfinite(hard.frame.depth_m).mean() < np.isfinite(frame.depth_m).mean()
+        assert hard.truth is truth
+        assert hard.frame.camera == frame.camera
+    assert min(caps) > 0.1
+    assert min(beds) == 0
+    assert max(beds) > 0.1
 
 
 def test_only_some_features_are_squared() -> None:

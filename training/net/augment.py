@@ -141,11 +141,13 @@ def _stained(image: Singles, cap: Singles, rng: np.random.Generator) -> Singles:
 
 def blotched(image: Singles, where: Singles, rng: np.random.Generator) -> Singles:
     """Blotch what lies in `where` (H, W) 0..1, more in some places than in others."""
-    size = image.shape[0]
+    height, width = where.shape
+    size = max(height, width)
 
     def smooth(cells: int) -> Singles:
         field = rng.standard_normal((cells, cells), np.float32)
-        return np.asarray(cv2.resize(field, (size, size), interpolation=cv2.INTER_CUBIC))
+        square = cv2.resize(field, (size, size), interpolation=cv2.INTER_CUBIC)
+        return np.asarray(square[:height, :width])
 
     fine = smooth(int(size / rng.uniform(3, 16)))
     amount = 1 / (1 + np.exp(-np.float32(rng.uniform(2, 6)) * fine - 3 * smooth(5)))

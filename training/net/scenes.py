@@ -120,7 +120,7 @@ def _render(seed: int, path: Path) -> None:
     np.savez(
         part,
         color=cv2.imencode(".png", frame.color[..., ::-1])[1],
-        cap=cv2.imencode(".png", _caps(truth, instances).astype(np.uint8))[1],
+        cap=cv2.imencode(".png", cap_mask(truth, instances).astype(np.uint8))[1],
         circles=np.column_stack([truth.center, truth.radius]),
         kind=truth.ignore,
         visible=truth.visible,
@@ -128,7 +128,8 @@ def _render(seed: int, path: Path) -> None:
     part.rename(path)
 
 
-def _caps(truth: Truth, instances: Instances) -> NDArray[np.bool_]:
+def cap_mask(truth: Truth, instances: Instances) -> NDArray[np.bool_]:
+    """Return the pixels (H, W) of caps; those of cut stumps are none."""
     return np.append(False, truth.ignore != Ignore.CUT_STUMP)[instances.labels]
 
 
