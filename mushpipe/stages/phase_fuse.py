@@ -33,16 +33,18 @@ def confirm(
         (M,) True where there is no better gray edge of about the same direction.
     """
     height, width = pixels.shape
-    alone = np.ones(len(x), np.bool_)
+    alone, near = np.ones(len(x), np.bool_), np.empty((2 * reach + 1) ** 2, np.int32)
     for k in range(len(x)):
-        u, v = int(x[k] + 0.5), int(y[k] + 0.5)
+        u, v, count = int(x[k] + 0.5), int(y[k] + 0.5), 0
+        left, right = max(u - reach, 0), min(u + reach + 1, width)
         for row in range(max(v - reach, 0), min(v + reach + 1, height)):
-            for column in range(max(u - reach, 0), min(u + reach + 1, width)):
+            for column in range(left, right):
                 j = pixels[row, column]
-                if j < 0 or nx[k] * gray.nx[j] + ny[k] * gray.ny[j] < 0.8:
-                    continue
-                if trust[j] > DEPTH_ALONE:
-                    alone[k] = False
+                near[count] = j
+                count += j >= 0  # a branch would be guessed wrong
+        for j in near[:count]:
+            if nx[k] * gray.nx[j] + ny[k] * gray.ny[j] >= 0.8:
+                alone[k] &= trust[j] <= DEPTH_ALONE
                 gray.weight[j] = trust[j]
     return alone
 

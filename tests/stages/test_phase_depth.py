@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mushpipe.stages.phase_depth import halved
+from mushpipe.stages.phase_depth import halved, with_standing
 
 
 @pytest.mark.parametrize("shape", [(6, 8), (7, 8), (6, 9), (5, 7)])
@@ -22,3 +22,13 @@ def test_depth_is_halved_to_the_mean_of_what_is_known(shape: tuple[int, int], na
         known = cell[np.isfinite(cell) & (cell > 0)]
         wanted = 0.001 * known.mean(dtype=float) if len(known) else -1
         assert small[y, x] == pytest.approx(wanted, rel=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(6, 8), (7, 8), (6, 9), (5, 7)])
+def test_what_stands_on_the_bed_is_added_to_the_mask(shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(4)
+    mask = (rng.random(shape) < 0.3).astype(np.uint8)
+    height = rng.random(((shape[0] + 1) // 2, (shape[1] + 1) // 2)).astype(np.float32) - 0.5
+    both = with_standing(mask, height, 0.1)
+    for y, x in np.ndindex(*shape):
+        assert both[y, x] == (mask[y, x] or height[y // 2, x // 2] > 0.1)
