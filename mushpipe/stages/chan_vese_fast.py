@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import inlined, jit
+from mushpipe.stages.doubling import doubled
 
 Floats = NDArray[np.float64]
 Plane = NDArray[np.float32]
@@ -199,18 +200,6 @@ def _solve_level(
     return u
 
 
-@jit
-def _doubled(small: Bits, height: int, width: int) -> Bits:
-    """Return a region of half the size at full size; of an odd one the last row stands thrice."""
-    out = np.empty((height, width), np.uint8)
-    for y in range(height):
-        row, line = small[min(y // 2, len(small) - 1)], out[y]
-        for x in range(len(row)):
-            line[2 * x] = line[2 * x + 1] = row[x]
-        line[-1] = row[-1]
-    return out
-
-
 def solve_fast(
     image: Plane,
     initial: NDArray[np.bool_],
@@ -255,7 +244,7 @@ def _pyramid(
         share = cv2.resize(2 * initial, half, interpolation=cv2.INTER_AREA)
         start = np.asarray(share > 1).view(np.uint8)
         solved = _pyramid(small, start, mu / 2, levels, depth - 1, 2 * iterations, 4 * sweeps)
-        u = _doubled(solved, height, width)
+        u = doubled(solved, height, width)
     else:
         u = initial.copy()
     c1, c2 = (np.full(len(planes), level) for level in levels or (0.0, 0.0))

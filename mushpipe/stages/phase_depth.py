@@ -91,21 +91,6 @@ def closed(height: Plane) -> Plane:
     return out
 
 
-@jit
-def with_standing(inside: NDArray[np.uint8], height: Plane, least: float) -> NDArray[np.uint8]:
-    """Return what is inside a mask (H, W) or stands higher than `least` (m), 0 or 1."""
-    out, lowest = inside.copy(), np.float32(least)
-    for y in range(inside.shape[0]):
-        row, line = height[y // CELL], out[y]
-        for x in range(len(line) // CELL):
-            stands = row[x] > lowest
-            for k in range(CELL):
-                line[CELL * x + k] |= stands
-        for x in range(len(line) // CELL * CELL, len(line)):
-            line[x] |= row[x // CELL] > lowest
-    return out
-
-
 class Relief:
     """The height of what stands on the bed.
 

@@ -12,9 +12,10 @@ from pydantic import Field, PrivateAttr, model_validator
 
 from mushpipe import Circles, InputError, Mask, RgbdFrame, Stage
 from mushpipe.core.stage import GraphPath
+from mushpipe.stages.doubling import doubled
 from mushpipe.stages.phase_blobs import blobs_of
 from mushpipe.stages.phase_decide import decide
-from mushpipe.stages.phase_depth import NO_RELIEF, Relief, relief_of, with_standing
+from mushpipe.stages.phase_depth import NO_RELIEF, Relief, relief_of
 from mushpipe.stages.phase_edges import (
     Gradient,
     Plane,
@@ -163,7 +164,7 @@ class PhaseHough(Stage):
         inside = mask.foreground.view(np.uint8)
         if learned is not None:
             inside = add_discs(learned, inside)
-        foreground = with_standing(inside, relief.height, _STANDING) if relief else inside
+        foreground = _foreground(inside, relief)
         region = np.ones_like(foreground) if literal else cv2.dilate(foreground, _AROUND)
         edges = self._edges(image, gradient, np.asarray(region, np.uint8), relief)
         cells = vote(
@@ -243,3 +244,11 @@ def _levels(frame: RgbdFrame, mask: Mask, literal: bool) -> Plane:
     """Return what edges are taken from, (H, W) in 0..255."""
     image = mask.foreground if literal else frame.gray
     return np.asarray(image, np.float32) * np.float32(255)
+
+
+def _foreground(inside: Bytes, relief: Relief | None) -> Bytes:
+    """Return what is inside a mask or stands on the bed, (H, W) 0 or 1."""
+    if relief is None:
+        return inside
+    standing = (relief.height > _STANDING).view(np.uint8)
+    return np.asarray(inside | doubled(standing, *inside.shape), np.uint8)

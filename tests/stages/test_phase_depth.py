@@ -1,9 +1,13 @@
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
-from mushpipe.stages.phase_depth import halved, with_standing
+from mushpipe.stages.phase_depth import halved
+from mushpipe.stages.phase_hough import _foreground
 
 
 @pytest.mark.parametrize("shape", [(6, 8), (7, 8), (6, 9), (5, 7)])
@@ -28,7 +32,8 @@ def test_depth_is_halved_to_the_mean_of_what_is_known(shape: tuple[int, int], na
 def test_what_stands_on_the_bed_is_added_to_the_mask(shape: tuple[int, int]) -> None:
     rng = np.random.default_rng(4)
     mask = (rng.random(shape) < 0.3).astype(np.uint8)
-    height = rng.random(((shape[0] + 1) // 2, (shape[1] + 1) // 2)).astype(np.float32) - 0.5
-    both = with_standing(mask, height, 0.1)
+    height = rng.random(((shape[0] + 1) // 2, (shape[1] + 1) // 2)).astype(np.float32) / 100
+    relief: Any = SimpleNamespace(height=height)
+    both = _foreground(mask, relief)
     for y, x in np.ndindex(*shape):
-        assert both[y, x] == (mask[y, x] or height[y // 2, x // 2] > 0.1)
+        assert both[y, x] == (mask[y, x] or height[y // 2, x // 2] > 0.004)
