@@ -17,7 +17,7 @@ from mushpipe import Circles, RgbdFrame
 from mushpipe.core.truth import Truth
 from mushpipe.evaluate.matching import circle_iou
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_verify import MODEL, NAMES, features
+from mushpipe.stages.cap_verify import MODEL, NAMES, features, flat
 from mushpipe.stages.phase_hough import PhaseHough
 from training.harder import harder
 from training.matching import counted, matched
@@ -52,7 +52,7 @@ def labels(circles: Circles, truth: Truth) -> Floats:
 
 
 def samples(cache: Path) -> tuple[Floats, Floats]:
-    """Return features (N, F) and labels (N,) of all circles that could be fitted."""
+    """Return features (N, F) and labels (N,) of all circles whose fit decides, flat ones aside."""
     stage, rng = CapFit(), np.random.default_rng(7)
     rows, right = [], []
     for case in chain(training_cases(cache), varied_cases(cache, "a", VARIED)):
@@ -64,7 +64,7 @@ def samples(cache: Path) -> tuple[Floats, Floats]:
                     continue
                 fits = stage.fit(frame.gray, frame.depth_m, frame.camera, circles)
                 label = labels(circles, case.truth)
-                use = fits.valid & np.isfinite(label)
+                use = fits.valid & ~flat(fits) & np.isfinite(label)
                 rows.append(features(circles, fits)[use])
                 right.append(label[use])
     return np.concatenate(rows), np.concatenate(right)

@@ -179,7 +179,7 @@ def limit(cap: Floats, step: Floats, size: float) -> None:
         step[4] *= 0.35 / turn
     radius = min(max(cap[RADIUS] + step[5], 0.6 * size, 0.8 * cap[RADIUS]), 1.6 * size)
     step[5] = min(radius, 1.2 * cap[RADIUS]) - cap[RADIUS]
-    low, high = 0.2 * radius, 1.3 * radius
+    low, high = 0.08 * radius, 1.3 * radius
     step[6] = min(max(cap[HEIGHT] + step[6], low), high) - cap[HEIGHT]
     step[7] = min(max(cap[BULGE] + step[7], -BULGE_LIMIT), BULGE_LIMIT) - cap[BULGE]
 

@@ -20,6 +20,10 @@ Floats = NDArray[np.float64]
 MODEL = "fitted"
 FILE = f"{MODEL}.yaml"
 ROUND = 0.6  # height over radius; a rounder cap is no more, and no less, likely one
+# Flatter than any cap in the training scenes: lids, cups upside down, paper and cut stumps. It is a
+# rule because a regression over standardised features gives rare ones little weight.
+FLAT = 0.15  # height over radius
+FLAT_CHANCE = 0.01  # of 127 that flat in the training scenes none was a cap
 NAMES = ("score", "misfit", "tilt", "aspect", "moved")
 
 
@@ -45,14 +49,23 @@ def features(circles: Circles, fits: Fits) -> Floats:
     return table
 
 
+def flat(fits: Fits) -> NDArray[np.bool_]:
+    """Return which fits (N,) are flatter than a cap; False where nothing was fitted."""
+    return np.asarray(fits.valid & (fits.height < FLAT * fits.radius))
+
+
 def chances(circles: Circles, fits: Fits) -> Floats:
     """Return the probability (N,) of each circle to be a cap; its score where nothing was fitted.
+
+    One whose fit is flat has `FLAT_CHANCE` at most.
 
     Args:
         circles: As detected, with the scores of `phase-hough`.
         fits: Of these circles.
     """
-    return np.where(fits.valid, probability(features(circles, fits), _weights()), circles.score)
+    chance = probability(features(circles, fits), _weights())
+    chance = np.where(flat(fits), np.minimum(chance, FLAT_CHANCE), chance)
+    return np.where(fits.valid, chance, circles.score)
 
 
 @lru_cache(maxsize=1)

@@ -7,7 +7,7 @@ import pytest
 
 from mushpipe import Circles, DepthSource, RgbdFrame
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_verify import NAMES, chances, features
+from mushpipe.stages.cap_verify import FLAT_CHANCE, NAMES, chances, features
 from mushpipe.stages.verifier import LIMIT, probability
 from tests.stages.caps import CAMERA, cap, circles_of, draw, frame_from
 
@@ -46,6 +46,21 @@ def test_caps_stay_and_what_only_looks_like_one_goes() -> None:
     _, _, all_of_them = CapFit(up="camera", min_score=0.0).process(frame, circles)
     assert all_of_them.score[:4] == pytest.approx(found.score)
     assert (all_of_them.score[4:] < 0.5).all()
+
+
+def test_a_lid_is_no_cap_however_sure_the_detector_is_and_a_flat_cap_is_one() -> None:
+    flat = [cap(8, 70, (-0.06, 0, 0.4), 0.02, 0.22), cap(0, 0, (0.06, 0, 0.4), 0.02, 0.22)]
+    depth, gray = draw(flat, BED)
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    circles = circles_of(flat)
+    lid = np.hypot(u - 160, v - 40) < 20
+    depth[lid], gray[lid] = 0.4, 0.8
+    depth += np.random.default_rng(1).normal(0, 0.0008, depth.shape)
+    center, radius = np.vstack([circles.center, [[160, 40]]]), [*circles.radius, 20.0]
+    circles = Circles(center, radius, np.full(3, 0.99))
+    _, _, found = CapFit(up="camera", min_score=0.0).process(frame_from(depth, gray), circles)
+    assert found.score[2] <= FLAT_CHANCE
+    assert (found.score[:2] > 0.9).all()
 
 
 def test_without_a_least_score_nothing_is_left_out_and_scores_stay() -> None:
