@@ -16,6 +16,7 @@ from mushpipe.sources.mcap import McapSource
 from mushpipe.sources.synthetic import SyntheticSource
 
 RECORDINGS = ("white-bed-0", "beds-colour-only", "desk-june", "desk-july")
+SIMULATED = Path(__file__).parents[2] / "recordings"
 
 
 @cache
@@ -44,6 +45,11 @@ def recorded(name: str) -> list[RgbdFrame]:
     if not path.is_file():
         pytest.skip(f"there is no {path}")
     return list(McapSource(path=path).frames())
+
+
+def first(name: str) -> RgbdFrame:
+    """The first frame of one of the project's recordings."""
+    return next(iter(McapSource(path=SIMULATED / f"{name}.mcap").frames()))
 
 
 def iou(found: np.ndarray, truth: np.ndarray) -> float:

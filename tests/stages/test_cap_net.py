@@ -12,22 +12,15 @@ from mushpipe.core.errors import UsageError
 from mushpipe.core.recording import RecordingReader
 from mushpipe.core.truth import INSTANCES_TOPIC, TRUTH_TOPIC, Truth
 from mushpipe.core.wire import decode_table
-from mushpipe.sources.mcap import McapSource
 from mushpipe.stages.cap_net import KIND, CapNet
-from tests.stages.frames import iou, simulated
+from tests.stages.frames import SIMULATED, first, iou, simulated
 from tests.stages.networks import answering
 from tests.stages.scenes import HEADER
 from training.matching import Score, counted
 
-RECORDINGS = Path(__file__).parents[2] / "recordings"
-
-
-def first(name: str) -> RgbdFrame:
-    return next(iter(McapSource(path=RECORDINGS / f"{name}.mcap").frames()))
-
 
 def truth_of(name: str) -> Truth:
-    messages = RecordingReader(RECORDINGS / f"{name}.mcap").messages({TRUTH_TOPIC})
+    messages = RecordingReader(SIMULATED / f"{name}.mcap").messages({TRUTH_TOPIC})
     raw = next(iter(messages))
     table = decode_table(raw.schema.name, raw.message.data).table
     assert isinstance(table, Truth)
