@@ -80,10 +80,8 @@ train-seeds: train
 
 $(NET)/seed-%.onnx:
 	$(BIN)/python -m training.net.train --seed $* --out $(NET)/seed-$*.pt
-	$(BIN)/python -m training.net.train --seed 1$* --start $(NET)/seed-$*.pt --steps 1500 \
-	  --rate 1e-3 --near 0.5 --out $(NET)/seed-$*.pt
-	$(BIN)/python -m training.net.train --seed 2$* --start $(NET)/seed-$*.pt --steps 3500 \
-	  --rate 1e-3 --near 0.3 --stained --out $(NET)/stained-$*.pt
+	$(BIN)/python -m training.net.train --seed 2$* --start $(NET)/seed-$*.pt --steps 8000 \
+	  --rate 1.2e-3 --stained --out $(NET)/stained-$*.pt
 	$(BIN)/python -m training.net.export --weights $(NET)/seed-$*.pt $(NET)/stained-$*.pt --out $@
 
 # A long replay with every sink attached, whose memory must stay flat; MINUTES=5 for a short one.

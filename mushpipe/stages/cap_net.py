@@ -35,7 +35,7 @@ _KNOWN = (7.0, 60.0)
 
 
 class CapNet(Stage):
-    """Detects caps in colour with a network of 131 000 parameters, trained on simulated beds.
+    """Detects caps in colour with a network of 161 000 parameters, trained on simulated beds.
 
     Heat map, radius, offset and mask at a quarter of the resolution (after CenterNet, Zhou et al.
     2019, arXiv 1904.07850). The score is the height of a circle's peak. Depth is not used.
@@ -45,7 +45,7 @@ class CapNet(Stage):
         (8, 45), description="smallest and largest radius, px; the image is scaled to suit"
     )
     min_score: float = Field(
-        0.37, ge=0, le=1, description="smallest score that is kept; chosen on simulated beds"
+        0.527, ge=0, le=1, description="smallest score that is kept; chosen on simulated beds"
     )
     overlap: float = Field(0.4, ge=0, le=1, description="largest IoU of two circles")
     model: GraphPath | None = Field(None, description="another model than the package's, ONNX")

@@ -41,6 +41,7 @@ _TOP = 64.0  # gray levels per px; larger gradients count as this in Otsu's thre
 _AROUND = np.ones((7, 7), np.uint8)  # edges are taken so far around the foreground
 _STANDING = 0.004  # m; what is higher than this over the bed is looked at, in the mask or not
 _REACH = 2  # cells around a peak within which it must be the highest
+_SEEN = 0.15  # of `learned`; without depth, what the network sees less of is no cap
 _LIKELY = 0.5  # score from which on a circle is more likely a cap than not
 _SMALLEST = 12  # px; images smaller than this in either direction hold no circle
 
@@ -183,6 +184,8 @@ class PhaseHough(Stage):
         if learned is not None:
             table[:, NAMES.index(LEARNED)] = agreement(shapes, equal_area_radius(shapes), learned)
         kept = self._plausible(shapes, middle, relief)
+        if learned is not None:
+            kept &= np.isfinite(middle) | (table[:, NAMES.index(LEARNED)] >= _SEEN)
         return Evidence(edges, shapes[kept], hits[kept], table[kept], middle[kept], high, pixel)
 
     def decide(self, found: Evidence) -> tuple[Rows, Table, Rows]:

@@ -6,6 +6,7 @@ import pytest
 from mushpipe import Circles, InputError, Mask
 from mushpipe.stages.phase_hough import PhaseHough
 from mushpipe.stages.phase_learned import add_discs, agreement, candidates_of
+from tests.stages.caps import cap, draw, frame_from
 from tests.stages.scenes import discs, frame_of
 
 
@@ -56,11 +57,22 @@ def test_circles_above_change_nothing_unless_asked_for() -> None:
     assert np.array_equal(alone.score, beside.score)
 
 
-def test_where_no_circle_lies_the_other_detector_has_nothing_to_say() -> None:
-    image = discs([(40, 60, 20), (110, 60, 15)], 0.8, 0.1)
-    frame, mask = frame_of(image), Mask(image > 0.5)
+def test_with_depth_the_network_has_nothing_to_say_where_none_of_its_circles_lies() -> None:
+    caps = [cap(5, 40, (-0.05, 0, 0.4), 0.02, 0.55), cap(10, 200, (0.05, 0, 0.4), 0.022, 0.6)]
+    depth, gray = draw(caps, 0.44)
+    frame, mask = frame_from(depth, gray), Mask(depth < 0.435)
     alone = PhaseHough().process(frame, mask)
     asked = PhaseHough(use_learned=True).process(frame, mask, circles())
     assert len(alone) == 2
     assert np.array_equal(alone.center, asked.center)
     assert np.array_equal(alone.score, asked.score)
+
+
+def test_without_depth_what_the_network_does_not_see_is_no_cap() -> None:
+    image = discs([(40, 60, 20), (110, 60, 15)], 0.8, 0.1)
+    frame, mask = frame_of(image), Mask(image > 0.5)
+    assert len(PhaseHough().process(frame, mask)) == 2
+    stage = PhaseHough(use_learned=True)
+    assert len(stage.process(frame, mask, circles())) == 0
+    seen = stage.process(frame, mask, circles((109, 61, 15, 0.6)))
+    assert seen.center == pytest.approx(np.array([[110, 60]]), abs=0.5)

@@ -1,7 +1,9 @@
 """The network: after CenterNet (Zhou, Wang & Kraehenbuehl 2019, arXiv 1904.07850), but tiny.
 
 Strides 2 to 32: full convolutions down to stride 4, depthwise-separable residual blocks below, an
-additive top-down path (Lin et al. 2017, arXiv 1612.03144), one head at stride 4.
+additive top-down path (Lin et al. 2017, arXiv 1612.03144), one head at stride 4. Widths are whole
+multiples of 16, since ONNX Runtime computes as many channels at a time, and what follows a sum is
+one operation with it; both make the network a fifth faster.
 """
 
 from __future__ import annotations
@@ -14,24 +16,30 @@ from torch.nn import functional
 
 from mushpipe.stages.cap_decode import CHANNELS, HEAT, MASK, OFFSET, RADIUS
 
-WIDTHS = (32, 56, 96, 128)  # channels at strides 4, 8, 16, 32
-NECK = 40
+WIDTHS = (32, 64, 96, 128)  # channels at strides 4, 8, 16, 32
+BLOCKS = (2, 3, 3)  # residual blocks at strides 8, 16, 32
+NECK = 32
+
+
+def normed(inputs: int, outputs: int, size: int, stride: int = 1, groups: int = 1) -> nn.Sequential:
+    """Return a convolution and batch norm."""
+    conv = nn.Conv2d(inputs, outputs, size, stride, size // 2, groups=groups, bias=False)
+    return nn.Sequential(conv, nn.BatchNorm2d(outputs))
 
 
 def convolution(inputs: int, outputs: int, size: int, stride: int = 1) -> nn.Sequential:
     """Return a full convolution, batch norm and ReLU."""
-    conv = nn.Conv2d(inputs, outputs, size, stride, size // 2, bias=False)
-    return nn.Sequential(conv, nn.BatchNorm2d(outputs), nn.ReLU())
+    return nn.Sequential(*normed(inputs, outputs, size, stride), nn.ReLU())
 
 
 def separable(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
-    """Return a 5x5 depthwise and a 1x1 convolution, each with batch norm, ReLU last."""
-    deep = nn.Conv2d(inputs, inputs, 5, stride, 2, groups=inputs, bias=False)
-    return nn.Sequential(deep, nn.BatchNorm2d(inputs), *convolution(inputs, outputs, 1))
+    """Return a 5x5 depthwise and a 1x1 convolution, each with batch norm."""
+    deep = normed(inputs, inputs, 5, stride, groups=inputs)
+    return nn.Sequential(*deep, *normed(inputs, outputs, 1))
 
 
 class Residual(nn.Module):
-    """x + separable(x)."""
+    """ReLU(x + separable(x))."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -39,8 +47,7 @@ class Residual(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply it."""
-        result: Tensor = x + self.body(x)
-        return result
+        return functional.relu(x + self.body(x))
 
 
 class CapNet(nn.Module):
@@ -53,7 +60,8 @@ class CapNet(nn.Module):
             convolution(3, 16, 3, 2), convolution(16, first, 3, 2), Residual(first)
         )
         self.down = nn.ModuleList(
-            nn.Sequential(separable(a, b, 2), Residual(b), Residual(b)) for a, b in pairwise(WIDTHS)
+            nn.Sequential(*separable(a, b, 2), nn.ReLU(), *(Residual(b) for _ in range(blocks)))
+            for (a, b), blocks in zip(pairwise(WIDTHS), BLOCKS, strict=True)
         )
         self.lateral = nn.ModuleList(nn.Conv2d(width, NECK, 1) for width in WIDTHS)
         self.merge = nn.ModuleList(Residual(NECK) for _ in WIDTHS)
@@ -66,7 +74,7 @@ class CapNet(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """Return the raw output."""
-        levels = [self.stem(image - 0.4)]
+        levels = [self.stem(image)]
         for down in self.down:
             levels.append(down(levels[-1]))
         top: Tensor | None = None

@@ -8,31 +8,38 @@ from __future__ import annotations
 import argparse
 import copy
 import time
+from collections.abc import Iterable, Iterator
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import nn
+from torch.utils.data import DataLoader, IterableDataset
 
 from training.net.augment import crop
 from training.net.model import CapNet, loss_of
 from training.net.scenes import TRAINING, TRAINING_SEED, Picture, picture
 
 SIZE, BATCH, RATE, DECAY = 224, 8, 2.5e-3, 0.998
+NEAR = 0.3  # share of the crops that are taken around a cap
+
+Batch = tuple[torch.Tensor, ...]
 
 
-class Crops:
-    """Batches from the frames, with a generator of their own."""
+class Crops(IterableDataset[Batch]):
+    """Batches from the frames without end, with a generator of their own."""
 
-    def __init__(self, frames: list[Picture], seed: int, near: float, stained: bool) -> None:
-        self._frames, self._rng = frames, np.random.default_rng([seed, 9])
-        self._near, self._stained = near, stained
+    def __init__(self, frames: list[Picture], seed: int, stained: bool) -> None:
+        self._frames, self._seed, self._stained = frames, seed, stained
 
-    def batch(self) -> tuple[torch.Tensor, ...]:
-        """Return images, targets and weights."""
-        picks = self._rng.integers(len(self._frames), size=BATCH)
-        rows = [crop(self._frames[k], SIZE, self._rng, self._near, self._stained) for k in picks]
-        return tuple(torch.from_numpy(np.stack(part)) for part in zip(*rows, strict=True))
+    def __iter__(self) -> Iterator[Batch]:
+        """Yield images, targets and weights."""
+        rng = np.random.default_rng([self._seed, 9])
+        while True:
+            picks = rng.integers(len(self._frames), size=BATCH)
+            rows = [crop(self._frames[k], SIZE, rng, NEAR, self._stained) for k in picks]
+            yield tuple(torch.from_numpy(np.stack(part)) for part in zip(*rows, strict=True))
 
 
 def averaged(slow: nn.Module, fast: nn.Module, step: int) -> None:
@@ -46,7 +53,7 @@ def averaged(slow: nn.Module, fast: nn.Module, step: int) -> None:
                 a.copy_(b)
 
 
-def train(net: CapNet, crops: Crops, steps: int, rate: float, out: Path) -> None:
+def train(net: CapNet, batches: Iterable[Batch], steps: int, rate: float, out: Path) -> None:
     """Train a network and write the running mean of its weights, every hundred steps.
 
     AdamW with a linear warm-up over 100 steps and a cosine to zero.
@@ -59,8 +66,7 @@ def train(net: CapNet, crops: Crops, steps: int, rate: float, out: Path) -> None
         lambda k: min(1.0, (k + 1) / 100) * 0.5 * (1 + np.cos(np.pi * k / steps)),
     )
     began, total = time.monotonic(), 0.0
-    for step in range(steps):
-        image, target, weight = crops.batch()
+    for step, (image, target, weight) in enumerate(islice(batches, steps)):
         output = net(image.to(memory_format=torch.channels_last))
         loss = loss_of(output, target, weight)
         optimizer.zero_grad()
@@ -84,9 +90,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cache", type=Path, default=Path("out/net"), help="rendered frames")
     parser.add_argument("--frames", type=int, default=TRAINING)
-    parser.add_argument("--steps", type=int, default=5000)
+    parser.add_argument("--steps", type=int, default=12000)
     parser.add_argument("--rate", type=float, default=RATE, help="largest learning rate")
-    parser.add_argument("--near", type=float, default=0.0, help="share of crops around a cap")
     parser.add_argument("--stained", action="store_true", help="blotched and overexposed as well")
     parser.add_argument("--start", type=Path, help="weights to go on from")
     parser.add_argument("--seed", type=int, default=0)
@@ -98,8 +103,9 @@ def main() -> None:
     net = CapNet()
     if arguments.start:
         net.load_state_dict(torch.load(arguments.start))
-    crops = Crops(frames, arguments.seed, arguments.near, arguments.stained)
-    train(net, crops, arguments.steps, arguments.rate, arguments.out)
+    crops = Crops(frames, arguments.seed, arguments.stained)
+    batches = DataLoader(crops, batch_size=None, num_workers=1)  # cut by a process of its own
+    train(net, batches, arguments.steps, arguments.rate, arguments.out)
 
 
 if __name__ == "__main__":
