@@ -61,9 +61,9 @@ verifier: $(STAMP) system-libraries
 	$(BIN)/python -m training.fitted
 
 # The network of `cap-net`, from nothing: frames, the one that ships, figures; `train-seeds` adds the
-# two that tell how much chance there is. A training gains nothing from a second core, so those run
-# side by side. PyTorch for the CPU comes from PyTorch's own index; elsewhere `torch` would bring CUDA
-# along.
+# two that tell how much chance there is. A training takes one core, and half of another to cut its
+# crops; meanwhile the one that ships is judged, which renders the frames for it. PyTorch for the CPU
+# comes from PyTorch's own index; elsewhere `torch` would bring CUDA along.
 NET := out/net
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 .PHONY: train train-seeds
@@ -71,7 +71,8 @@ train: $(STAMP) system-libraries
 	$(BIN)/pip install --quiet --editable '.[train]' --extra-index-url $(TORCH_INDEX)
 	for part in 0 1; do $(BIN)/python -m training.net.scenes --part $$part --of 2 & pids="$$pids $$!"; \
 	  done; for pid in $$pids; do wait $$pid || exit 1; done
-	OMP_NUM_THREADS=1 $(MAKE) --always-make $(NET)/seed-1.onnx
+	nice $(BIN)/python -m training.net.judge > $(NET)/shipped.txt & \
+	  OMP_NUM_THREADS=1 $(MAKE) --always-make $(NET)/seed-1.onnx && wait
 	$(BIN)/python -m training.net.judge --peers --models $(NET)/seed-1.onnx
 
 train-seeds: train
