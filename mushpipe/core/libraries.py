@@ -22,11 +22,12 @@ _APT = {
 
 
 def import_open3d() -> Any:
-    """Import open3d.
+    """Import open3d, with libusb as `import_realsense` has it: open3d links to it for its cameras.
 
     Raises:
         DependencyError: It is not installed, or a system library is missing.
     """
+    _load_libusb()
     return _import("open3d")
 
 
@@ -36,11 +37,7 @@ def import_realsense() -> Any:
     Raises:
         DependencyError: It is not installed, or a system library is missing.
     """
-    try:
-        library = importlib.import_module("libusb_package").get_library_path()
-        ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
-    except (ImportError, OSError):
-        pass  # the system may have its own libusb; if not, the import below says so
+    _load_libusb()
     return _import("pyrealsense2")
 
 
@@ -51,6 +48,14 @@ def import_onnxruntime() -> Any:
         DependencyError: It is not installed, or a system library is missing.
     """
     return _import("onnxruntime")
+
+
+def _load_libusb() -> None:
+    try:
+        library = importlib.import_module("libusb_package").get_library_path()
+        ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
+    except (ImportError, OSError):
+        pass  # the system may have its own libusb; if not, the import that needs it says so
 
 
 def _import(name: str) -> Any:

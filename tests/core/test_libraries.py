@@ -57,12 +57,16 @@ def test_a_good_import(world):
     assert libraries.import_open3d() is world["open3d"]
 
 
-def test_libusb_is_loaded_before_realsense(world, monkeypatch):
+@pytest.mark.parametrize(
+    ("name", "load"),
+    [("pyrealsense2", libraries.import_realsense), ("open3d", libraries.import_open3d)],
+)
+def test_libusb_is_loaded_before_what_links_to_it(world, monkeypatch, name, load):
     order = []
     world["libusb_package"] = SimpleNamespace(get_library_path=lambda: "/x/libusb-1.0.so")
-    world["pyrealsense2"] = ModuleType("pyrealsense2")
+    world[name] = ModuleType(name)
     monkeypatch.setattr(libraries.ctypes, "CDLL", lambda path, mode: order.append(path))
-    assert libraries.import_realsense() is world["pyrealsense2"]
+    assert load() is world[name]
     assert order == ["/x/libusb-1.0.so"]
 
 

@@ -6,6 +6,8 @@ from collections.abc import Callable
 
 import pytest
 
+from mushpipe.core.errors import DependencyError
+from mushpipe.core.libraries import import_open3d
 from mushpipe.sim.mesh import Material
 from mushpipe.sim.mushroom import Mushroom
 from mushpipe.sim.planting import Area
@@ -16,7 +18,10 @@ from mushpipe.sim.world import World, assemble
 
 @pytest.fixture(autouse=True)
 def _open3d() -> None:
-    pytest.importorskip("open3d", reason="open3d needs libGL and libEGL", exc_type=ImportError)
+    try:
+        import_open3d()
+    except DependencyError as error:
+        pytest.skip(str(error))
 
 
 @pytest.fixture
