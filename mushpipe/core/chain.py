@@ -8,6 +8,7 @@ since the next one takes them in order.
 
 from __future__ import annotations
 
+import gc
 import sys
 import threading
 import time
@@ -128,18 +129,22 @@ class Chain:
 
 @contextmanager
 def cores_shared() -> Iterator[None]:
-    """Let the threads of a run share two cores well, while it lasts."""
+    """Let the threads of a run share cores and interpreter well, while it lasts."""
     import cv2
 
     interval, helpers = sys.getswitchinterval(), cv2.getNumThreads()
     # A stage that comes back from a kernel asks for the interpreter, and would wait for the 5 ms
     # that Python gives a sink by default.
     sys.setswitchinterval(5e-4)
+    # What was made until now stays: 200 000 objects of libraries that a full collection would look
+    # through again every few seconds, for 50 to 100 ms in which no thread runs.
+    gc.freeze()
     # The cores are busy with stages and sinks; OpenCV's own threads would only spin beside them.
     cv2.setNumThreads(1)
     try:
         yield
     finally:
+        gc.unfreeze()
         sys.setswitchinterval(interval)
         cv2.setNumThreads(helpers)
 

@@ -1,5 +1,6 @@
 """Frames that follow one another through the stages: order, overlap, and failures out of turn."""
 
+import gc
 import random
 import sys
 import threading
@@ -163,3 +164,18 @@ def test_what_a_run_sets_for_its_threads_is_put_back(lab: Lab) -> None:
     lab.run(lab.chain(Looks))
     assert seen[0] == (pytest.approx(5e-4), 1)
     assert (sys.getswitchinterval(), cv2.getNumThreads()) == before
+
+
+def test_the_collector_leaves_alone_what_was_made_before_the_first_frame(lab: Lab) -> None:
+    seen: list[bool] = []
+    old: list[object] = [[]]  # not a constant: the collector tracks it
+
+    class Looks(Stage):
+        def process(self, frame: RgbdFrame) -> Mask:
+            seen.append(any(each is old for each in gc.get_objects()))
+            return Mask(frame.color[..., 0] > 0)
+
+    assert any(each is old for each in gc.get_objects())
+    lab.run(lab.chain(Looks), "source.count=2")
+    assert seen == [False, False]
+    assert any(each is old for each in gc.get_objects())
