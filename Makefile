@@ -56,7 +56,7 @@ test-slow: $(STAMP)-dev system-libraries
 
 # Weights of the verifiers of detector and cap fit, from simulated scenes alone; rendering takes minutes.
 .PHONY: verifier
-verifier: $(STAMP) system-libraries
+verifier: $(STAMP)-dev system-libraries
 	$(BIN)/python -m training.verifier
 	$(BIN)/python -m training.fitted
 

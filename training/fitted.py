@@ -19,11 +19,13 @@ from mushpipe.evaluate.matching import circle_iou
 from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.cap_verify import MODEL, NAMES, features, flat
 from mushpipe.stages.phase_hough import PhaseHough
+from mushpipe.stages.verifier import LIMIT
 from training.harder import harder
+from training.logistic import Floats, fit, write
 from training.matching import counted, matched
-from training.net.scenes import varied_cases
+from training.net.scenes import VERIFIER_SEED, varied_cases
 from training.scenes import training_cases
-from training.verifier import NET, RADII, VARIED, Floats, fit, segmentations, write
+from training.verifier import NET, RADII, VARIED, segmentations
 
 LEAST = 0.1  # score
 NEUTRAL = 0.3  # IoU with a mushroom that need not be found, from which on a circle teaches nothing
@@ -32,7 +34,7 @@ BESIDE = PhaseHough(radius_px=RADII, min_score=LEAST, use_learned=True)
 HEAD = """\
 # The verifier of the stage `cap-fit`: a logistic regression over what the fit found, made by
 # `make verifier` from simulated scenes alone. A feature x (docs/detection.md says what each is)
-# adds  weight z + square z^2  to the logit, with z = (x - mean) / scale, clipped to -2.5..2.5.
+# adds  weight z + square z^2  to the logit, with z = (x - mean) / scale, clipped to -4..4.
 """
 
 
@@ -55,7 +57,7 @@ def samples(cache: Path) -> tuple[Floats, Floats]:
     """Return features (N, F) and labels (N,) of all circles whose fit decides, flat ones aside."""
     stage, rng = CapFit(), np.random.default_rng(7)
     rows, right = [], []
-    for case in chain(training_cases(cache), varied_cases(cache, "a", VARIED)):
+    for case in chain(training_cases(cache), varied_cases(cache, VERIFIER_SEED, "a", VARIED)):
         for frame in (case.frame, harder(case, rng).frame):
             if frame.camera is None or frame.depth is None:
                 continue
@@ -78,7 +80,7 @@ def main() -> None:
     parser.add_argument("--ridge", type=float, default=1e-3)
     arguments = parser.parse_args()
     rows, right = samples(arguments.cache)
-    write({MODEL: fit(rows, right, NAMES, arguments.ridge, ())}, arguments.out, HEAD)
+    write({MODEL: fit(rows, right, NAMES, arguments.ridge, LIMIT, ())}, arguments.out, HEAD)
     print(f"{len(right)} circles, {right.mean():.2f} right")
 
 

@@ -48,9 +48,9 @@ CONDITIONS: dict[str, dict[str, Any]] = {
 # How many frames of each condition a training run takes, seeds from 0 on.
 TRAINING = {
     "even": 8, "gradient": 5, "dense": 8, "brown": 6, "tilted": 8, "mixed": 4, "cream": 2,
-    "side": 3, "spot": 2, "harsh": 4, "near": 4, "far": 3, "oblique": 4, "lab": 4, "cloth": 2,
-    "paint": 2, "empty": 3, "bare": 3, "fallen": 6, "wood": 6,
-    "low": 8, "lids": 6,
+    "side": 3, "spot": 2, "harsh": 4, "near": 6, "far": 3, "oblique": 4, "lab": 8, "cloth": 4,
+    "paint": 4, "empty": 3, "bare": 10, "fallen": 6, "wood": 8,
+    "low": 8, "lids": 8,
 }  # fmt: skip
 CHOOSING = {
     "even": 3, "gradient": 3, "dense": 3, "brown": 3, "tilted": 4, "harsh": 2, "near": 1,

@@ -1,20 +1,23 @@
 """Make the verifier of `phase-hough` from simulated scenes: `python -m training.verifier`.
 
-In rounds: detect with the verifier there is, label every candidate by the simulator's truth, fit
-logistic regressions, and again, since features such as `support` depend on what was accepted.
+In rounds: detect with the verifier there is, label every candidate by the simulator's truth, learn,
+and again, since features such as `support` depend on what was accepted. Where there is depth, small
+networks learn; without it logistic regressions, since networks that look at simulated images alone
+find less in real ones.
 """
 
 from __future__ import annotations
 
 import argparse
+import warnings
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 from scipy.special import expit, logit
 
 from mushpipe import Circles, Mask, RgbdFrame
@@ -30,47 +33,43 @@ from mushpipe.stages.phase_features import (
     IMAGE_FEATURES,
     LEARNED,
     NAMES,
-    kinds,
 )
 from mushpipe.stages.phase_hough import PhaseHough, equal_area_radius
-from mushpipe.stages.verifier import COLUMNS, LIMIT
+from mushpipe.stages.phase_verifier import FILE
+from mushpipe.stages.verifier_net import LIMIT, WIDTHS, write_models
+from training import logistic
 from training.harder import harder, stained
 from training.matching import IOU
-from training.net.scenes import varied_cases
+from training.net.scenes import VERIFIER_SEED, varied_cases
 from training.scenes import Case, training_cases
 
 Floats = NDArray[np.float64]
+Parts = dict[str, Floats]  # of a model, as in `verifier_net.Models`
 RADII = (8.0, 45.0)
 Prepared = tuple[Case, RgbdFrame, Mask, Circles | None]
-VARIED = 20  # frames
+VARIED = 140  # frames
 BETTER = 0.15  # of IoU; less gained nothing on scenes that chose nothing
 NET = CapNet(radius_px=RADII, min_score=0.05)  # what it is unsure of is for the verifier to decide
-MODELS: dict[str, dict[str, Any]] = {
-    "image": {"use_depth": False},
-    "depth": {},
-    "low": {},
-    "mask": {"input": "mask"},
-    "image_learned": {"use_depth": False},
-    "depth_learned": {},
-    "low_learned": {},
-}
-KINDS = {"depth": 1, "low": 2}  # of `phase_features.kinds`; the others are 0
+RIDGE = 1e-3  # per candidate
+DECAY = 1e-4  # of a network's weights
+SCHEDULE = ((20, 2e-3), (10, 2.5e-4))  # passes over the candidates, and the rate of learning
+# How to detect, and which model learns from it.
+PASSES: tuple[tuple[dict[str, Any], str], ...] = (
+    ({"use_depth": False}, "image"),
+    ({}, "depth"),
+    ({"input": "mask"}, "mask"),
+    ({"use_depth": False, "use_learned": True}, "image_learned"),
+    ({"use_learned": True}, "depth_learned"),
+)
 FEATURES = {
     "image": tuple(IMAGE_FEATURES),
     "depth": (*IMAGE_FEATURES, *DEPTH_FEATURES),
-    "low": (*IMAGE_FEATURES, *DEPTH_FEATURES),
     "mask": tuple(name for name in IMAGE_FEATURES if name not in ("cover", "texture")),
     "image_learned": (*IMAGE_FEATURES, LEARNED),
     "depth_learned": NAMES,
-    "low_learned": NAMES,
 }
 # An ignored mushroom of these kinds is a cap all the same, or is surely none.
 RIGHT, WRONG = (Ignore.AT_BORDER, Ignore.TOO_LARGE), (Ignore.CUT_STUMP,)
-HEAD = """\
-# The verifier of the stage `phase-hough`: one logistic regression per kind of input, made by
-# `make verifier` from simulated scenes alone. A feature x (docs/detection.md says what each is)
-# adds  weight z + square z^2  to the logit, with z = (x - mean) / scale, clipped to -2.5..2.5.
-"""
 
 
 def segmentations(frame: RgbdFrame) -> list[tuple[RgbdFrame, Mask]]:
@@ -85,20 +84,16 @@ def segmentations(frame: RgbdFrame) -> list[tuple[RgbdFrame, Mask]]:
 def prepared(cache: Path) -> Iterator[Prepared]:
     """Yield the frames of the training, without and with the circles of `cap-net`.
 
-    Beside `cap-net` its mask takes the place of a segmentation. What is learnt there is learnt on
-    varied frames as well, as that is what it is for. A network is surer of frames like those it was
-    trained on than of any others, so each frame comes a second time with a `doubtful` one. And as
-    real caps are not as clean as simulated ones, all of that comes once more on a `stained` frame
-    and on a `harder` one.
+    Beside `cap-net` its mask takes the place of a segmentation. A network is surer of frames like
+    those it was trained on than of any others, so each frame comes a second time with a `doubtful`
+    one. And as real caps are not as clean as simulated ones, all of that comes once more on a
+    `stained` frame and on a `harder` one.
     """
     rng, other = np.random.default_rng(0), np.random.default_rng(1)
-    for clean in training_cases(cache):
+    for clean in chain(training_cases(cache), varied_cases(cache, VERIFIER_SEED, "a", VARIED)):
         for case in (clean, stained(clean, other), harder(clean, other)):
             for frame, mask in segmentations(case.frame):
                 yield case, frame, mask, None
-            yield from _beside(case, rng)
-    for clean in varied_cases(cache, "a", VARIED):
-        for case in (clean, stained(clean, other), harder(clean, other)):
             yield from _beside(case, rng)
 
 
@@ -144,108 +139,98 @@ def labels(case: Case, circles: Circles, order: NDArray[np.intp]) -> Floats:
     return result
 
 
-def samples(stage: PhaseHough, cases: Iterable[Prepared], kind: int) -> tuple[Floats, Floats]:
-    """Return features (N, F) and labels (N,) of all candidates of a kind in a pass over the scenes.
-
-    The kind is that of `phase_features.kinds`.
-    """
+def samples(stage: PhaseHough, cases: Iterable[Prepared], deep: bool) -> tuple[Floats, Floats]:
+    """Return features (N, F) and labels (N,) of the candidates with depth, or of those without."""
     rows, right = [np.zeros((0, len(NAMES)))], [np.zeros(0)]
     for case, frame, mask, learned in cases:
-        found = stage.gather(frame, mask, learned)
+        found = stage.gather(replace(frame), mask, learned)  # what a frame caches takes room
         if found is None or not len(found.shapes):
             continue
         order, chance, _ = stage.decide(found)
         circles = Circles(found.shapes[:, :2], equal_area_radius(found.shapes), chance)
         label = labels(case, circles, order)
-        use = np.isfinite(label) & (kinds(found.table, found.middle) == kind)
+        use = np.isfinite(label) & (np.isfinite(found.middle) == deep)
         rows.append(found.table[use])
         right.append(label[use])
     return np.concatenate(rows), np.concatenate(right)
 
 
-def fit(
-    features: Floats,
-    right: Floats,
-    names: tuple[str, ...],
-    ridge: float,
-    squared: tuple[str, ...],
-) -> dict[str, Any]:
-    """Return a model: logistic regression on standardised features (N, F) and the squares of some.
+def fit_logistic(features: Floats, right: Floats, names: tuple[str, ...]) -> Parts:
+    """Return a logistic regression on features (N, F) and their squares."""
+    model = logistic.fit(features, right, names, RIDGE, LIMIT, names)
+    columns = np.array([[*model["features"][name].values()] for name in names]).T
+    parts = dict(zip(("mean", "scale", "a", "s"), columns, strict=True))
+    return parts | {"b3": np.array([model["intercept"]])}
 
-    The ridge (per sample) keeps weights small; without class weights the probability is calibrated
-    on the scenes of the training.
+
+def fit_network(features: Floats, right: Floats, seed: int) -> Parts:
+    """Return a network that learnt from features (N, F) and labels (N,).
+
+    Without class weights its probability is calibrated on the scenes of the training. The rate of
+    learning drops once, so that the last steps settle.
     """
+    from sklearn.neural_network import MLPClassifier
+
     mean, scale = features.mean(axis=0), np.maximum(features.std(axis=0), 1e-3)
-    z = np.clip((features - mean) / scale, -LIMIT, LIMIT)
-    basis = np.column_stack([np.ones(len(z)), z, z * z * np.isin(names, squared)])
-
-    def loss(w: Floats) -> tuple[float, Floats]:
-        logit = basis @ w
-        value = np.logaddexp(0, logit).mean() - (right * logit).mean()
-        slope = basis.T @ (expit(logit) - right) / len(right)
-        slope[1:] += ridge * w[1:]
-        return float(value + 0.5 * ridge * (w[1:] ** 2).sum()), slope
-
-    w = minimize(loss, np.zeros(basis.shape[1]), jac=True, method="L-BFGS-B").x
-    first, second = w[1 : 1 + len(names)], w[1 + len(names) :]
-    table = np.column_stack([mean, scale, first, second]).round(4).tolist()
-    values = {n: dict(zip(COLUMNS, row, strict=True)) for n, row in zip(names, table, strict=True)}
-    return {"intercept": round(float(w[0]), 4), "features": values}
+    z = np.clip((features - mean) / scale, -LIMIT, LIMIT).astype(np.float32)
+    net = MLPClassifier(WIDTHS, alpha=DECAY, batch_size=512, warm_start=True, random_state=seed)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that it has not converged after so many passes
+        for passes, rate in SCHEDULE:
+            net.set_params(max_iter=passes, learning_rate_init=rate)
+            net.fit(z, right)
+    (w1, w2, w3), (b1, b2, b3) = net.coefs_, net.intercepts_
+    return {"mean": mean, "scale": scale, "w1": w1, "b1": b1, "w2": w2, "b2": b2, "w3": w3[:, 0],
+            "b3": b3}  # fmt: skip
 
 
-def first_guess() -> dict[str, Any]:
+def first_guess(names: tuple[str, ...]) -> Parts:
     """Return a model to start from: edges count for, hidden outline and overlap against."""
     weights = {"support": 6.0, "free": 2.0, "coherence": 3.0, "overlap": -3.0}
-    features = {n: dict(zip(COLUMNS, (0.5, 1.0, w, 0.0), strict=True)) for n, w in weights.items()}
-    return {"intercept": 0.0, "features": features}
+    a = np.array([weights.get(name, 0.0) for name in names])
+    return {"mean": np.full(len(a), 0.5), "scale": np.ones(len(a)), "a": a, "b3": np.zeros(1)}
 
 
-def write(models: dict[str, Any], path: Path, head: str = HEAD) -> None:
-    """Write the file of a verifier."""
-    lines = [head + "models:"]
-    for name, model in models.items():
-        lines += [f"  {name}:", f"    intercept: {model['intercept']}", "    features:"]
-        for feature, values in model["features"].items():
-            text = ", ".join(f"{column}: {value}" for column, value in values.items())
-            lines.append(f"      {feature}: {{{text}}}")
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def train(cache: Path, out: Path, rounds: int, ridge: float, names: list[str]) -> None:
-    """Train the models of these names and write them, beside the others that the file has.
+def train(cache: Path, out: Path, rounds: int, seed: int) -> None:
+    """Train all models and write them.
 
     Discs from depth alone are left out: hardly any is a cap that no edges voted for, and learning
     from them cost 0.1 to 0.2 points of F on the frames for choosing.
     """
     cases = [*prepared(cache)]
-    kept = yaml.safe_load(out.read_text(encoding="utf-8"))["models"] if out.exists() else {}
-    models = {name: first_guess() for name in MODELS} | kept
-    models |= {name: first_guess() for name in names}
-    write(models, out)
+    models = {name: (known, first_guess(known)) for name, known in FEATURES.items()}
+    write_models(out, models)
     for turn in range(rounds):
-        for name in names:
-            stage = PhaseHough(radius_px=RADII, verifier=out, use_blobs=False, **MODELS[name])
-            beside = name.endswith("learned")
-            chosen = [case for case in cases if (case[3] is not None) == beside]
-            kind = KINDS.get(name.removesuffix("_learned"), 0)
-            features, right = samples(stage, chosen, kind)
-            columns = [NAMES.index(feature) for feature in FEATURES[name]]
-            models[name] = fit(features[:, columns], right, FEATURES[name], ridge, NAMES)
-            print(f"round {turn + 1}, {name}: {len(right)} candidates, {right.mean():.2f} right")
-        write(models, out)
+        for settings, name in PASSES:
+            stage = PhaseHough(radius_px=RADII, verifier=out, use_blobs=False, **settings)
+            deep, known = name.startswith("depth"), FEATURES[name]
+            table, right = samples(stage, [case for case in cases if teaches(case, name)], deep)
+            rows = table[:, [NAMES.index(each) for each in known]]
+            fitted = fit_network(rows, right, seed) if deep else fit_logistic(rows, right, known)
+            models[name] = known, fitted
+            print(f"round {turn + 1}, {name}: {len(rows)} candidates", flush=True)
+            write_models(out, models)
+
+
+def teaches(case: Prepared, name: str) -> bool:
+    """Return whether a model learns from a frame: those beside `cap-net` from frames that have it.
+
+    Without depth and network a varied bed teaches a regression little but doubt.
+    """
+    beside = case[3] is not None
+    varied = case[0].condition == "varied"
+    return beside == name.endswith("learned") and (name not in ("image", "mask") or not varied)
 
 
 def main() -> None:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cache", type=Path, default=Path("out/scenes"), help="rendered frames")
-    parser.add_argument("--out", type=Path, default=Path("mushpipe/stages/verifier.yaml"))
+    parser.add_argument("--out", type=Path, default=Path(f"mushpipe/stages/{FILE}"))
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--ridge", type=float, default=1e-3)
-    parser.add_argument("--models", nargs="+", default=list(MODELS), choices=MODELS)
+    parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    names = arguments.models
-    train(arguments.cache, arguments.out, arguments.rounds, arguments.ridge, names)
+    train(arguments.cache, arguments.out, arguments.rounds, arguments.seed)
 
 
 if __name__ == "__main__":

@@ -60,6 +60,7 @@ class Fits:
         edges: (N,) number of rays along the depth edge.
         lines: (N,) number of rays along the outline in colour.
         misfit: (N,) mean squared residual, in sigmas.
+        lean: (N,) rad, of the axis off the upright.
     """
 
     valid: NDArray[np.bool_]
@@ -78,6 +79,7 @@ class Fits:
     edges: NDArray[np.int64]
     lines: NDArray[np.int64]
     misfit: Floats
+    lean: Floats
 
 
 @borrower
@@ -237,10 +239,12 @@ def fit_caps(
     rank, ranks = order
     up = (float(upright[0][0]), float(upright[0][1]), float(upright[0][2]))
     fit_all((gray, (*image, ranks), focal), circles, rank, (up, upright[1]), settings, out)
-    return _fits(*out)
+    return _fits(*out, upright[0])
 
 
-def _fits(circles: Floats, caps: Floats, covariances: Floats, told: Floats, counts: Floats) -> Fits:
+def _fits(
+    circles: Floats, caps: Floats, covariances: Floats, told: Floats, counts: Floats, up: Floats
+) -> Fits:
     return Fits(
         counts[:, 0] > 0,
         circles,
@@ -258,4 +262,5 @@ def _fits(circles: Floats, caps: Floats, covariances: Floats, told: Floats, coun
         counts[:, 1].astype(np.int64),
         counts[:, 2].astype(np.int64),
         counts[:, 5],
+        np.arccos(np.clip(caps[:, N : N + 3] @ up, -1, 1)),
     )

@@ -42,7 +42,9 @@ class CapNet(Stage):
     """
 
     radius_px: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]] = Field(
-        (8, 45), description="smallest and largest radius, px; the image is scaled to suit"
+        (8, 45),
+        description="smallest and largest radius, px; circles may be a tenth beyond; the image is "
+        "scaled to suit",
     )
     min_score: float = Field(
         0.527, ge=0, le=1, description="smallest score that is kept; chosen on simulated beds"
@@ -116,7 +118,7 @@ class CapNet(Stage):
         """Return which circles (N, 3) are within the range, their centres within the image."""
         x, y, radius = circles.T
         inside = (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
-        sized = (radius >= self.radius_px[0]) & (radius <= self.radius_px[1])
+        sized = (radius >= 0.9 * self.radius_px[0]) & (radius <= 1.1 * self.radius_px[1])
         return np.asarray(inside & sized)
 
     def _maps(self, color: NDArray[np.uint8]) -> Maps:

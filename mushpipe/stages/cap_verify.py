@@ -24,7 +24,7 @@ ROUND = 0.6  # height over radius; a rounder cap is no more, and no less, likely
 # rule because a regression over standardised features gives rare ones little weight.
 FLAT = 0.15  # height over radius
 FLAT_CHANCE = 0.01  # of 127 that flat in the training scenes none was a cap
-NAMES = ("score", "misfit", "tilt", "aspect", "moved")
+NAMES = ("score", "misfit", "tilt", "aspect", "moved", "resized", "lean")
 
 
 def features(circles: Circles, fits: Fits) -> Floats:
@@ -32,7 +32,8 @@ def features(circles: Circles, fits: Fits) -> Floats:
 
     Logit of the score; log of the misfit over the median in view, since what fits how well depends
     on the sensor; log of the sigma of the tilt, rad; height over radius, up to `ROUND`; how far the
-    fit moves the circle, in its radii.
+    fit moves the circle, in its radii; log of how much larger or smaller it makes it; how far the
+    axis leans off the upright, rad.
     """
     score = np.clip(circles.score, 1e-4, 1 - 1e-4)
     usual = max(np.median(fits.misfit[fits.valid]), 1e-6) if fits.valid.any() else 1.0
@@ -43,6 +44,8 @@ def features(circles: Circles, fits: Fits) -> Floats:
             np.log(np.clip(fits.sigma_tilt, 0.02, 3)),
             np.clip(fits.height / fits.radius, 0.2, ROUND),
             np.linalg.norm(fits.circle[:, :2] - circles.center, axis=1) / circles.radius,
+            np.abs(np.log(fits.circle[:, 2] / circles.radius)),
+            fits.lean,
         ]
     )
     table[~fits.valid] = np.nan

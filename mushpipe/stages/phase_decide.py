@@ -26,7 +26,7 @@ from mushpipe.stages.phase_refit import (
 )
 from mushpipe.stages.phase_scratch import Scratch, scratch_for
 from mushpipe.stages.phase_strips import Strips
-from mushpipe.stages.verifier import LIMIT
+from mushpipe.stages.verifier_net import Models, probability
 
 MARGIN = 1.0  # px; so far within an accepted circle an outline counts as hidden by it
 HOPELESS = 2e-5  # probability from which on nothing that is accepted later can help
@@ -99,31 +99,14 @@ def outline_features(
 
 
 @borrower
-def probability(row: Table, weights: Table) -> float:
-    """Return the logistic probability of a row of features.
-
-    Args:
-        row: (F,) features.
-        weights: (F + 1, 4): mean, scale, weight, weight of the square; the last row's weight is
-            the intercept.
-    """
-    logit = weights[-1, 2]
-    for k in range(len(row)):
-        z = (row[k] - weights[k, 0]) / weights[k, 1]
-        z = min(LIMIT, max(-LIMIT, z))
-        logit += weights[k, 2] * z + weights[k, 3] * z * z
-    return 1 / (1 + math.exp(-logit))
-
-
-@borrower
 def chance_beside(
     edges: Strips, shape: Shape, hits: Rows, owner: Rows, accepted: Table, row: Table,
-    weights: Table, scratch: Scratch,
+    models: Models, which: int, scratch: Scratch,
 ) -> float:  # fmt: skip
     """Return the probability of a candidate beside the accepted; writes what depends on them."""
     outline_features(edges, shape, hits, owner, accepted, row, scratch)
     overlap_features(shape, accepted, row)
-    return probability(row, weights)
+    return probability(row, models, which, scratch.first, scratch.second)
 
 
 @borrower
@@ -142,8 +125,8 @@ def _use_up(edges: Strips, shape: Shape, number: int, owner: Rows, scratch: Scra
 
 @jit
 def decide(
-    edges: Strips, shapes: Table, hits: Rows, table: Table, model: Rows,
-    weights: NDArray[np.float64], least: float,
+    edges: Strips, shapes: Table, hits: Rows, table: Table, which: Rows, models: Models,
+    least: float,
 ) -> tuple[Rows, Table, Rows]:  # fmt: skip
     """Accept candidates in the order of their probability.
 
@@ -153,8 +136,8 @@ def decide(
         hits: (N, D) rows of the edges that support them.
         table: (N, F) features; those that depend on others are written, as they stood when the
             candidate was accepted, or at the end.
-        model: (N,) which weights decide on a candidate.
-        weights: (M, F + 1, 4) of `probability`.
+        which: (N,) the model that decides on a candidate.
+        models: The models.
         least: Smallest probability that is accepted.
 
     Returns:
@@ -169,7 +152,7 @@ def decide(
     near = np.empty((n, 5))
     for k in range(n):
         chance[k] = chance_beside(
-            edges, shapes[k], hits[k], owner, near[:0], table[k], weights[model[k]], scratch
+            edges, shapes[k], hits[k], owner, near[:0], table[k], models, which[k], scratch
         )
     for count in range(n):
         best, top = -1, least
@@ -185,7 +168,7 @@ def decide(
             if waiting[k] and chance[k] > HOPELESS:
                 met = _accepted(shapes, waiting, beside[first[k] : first[k + 1]], near)
                 chance[k] = chance_beside(
-                    edges, shapes[k], hits[k], owner, near[:met], table[k], weights[model[k]],
+                    edges, shapes[k], hits[k], owner, near[:met], table[k], models, which[k],
                     scratch,
                 )  # fmt: skip
     return order, chance, owner

@@ -51,8 +51,6 @@ LEARNED = "learned"  # what circles of another detector say; see `phase_learned`
 NAMES = (*IMAGE_FEATURES, *DEPTH_FEATURES, LEARNED)
 FIRST_STATIC = list(NAMES).index("residual")
 FIRST_DEPTH = len(IMAGE_FEATURES)
-# What tells low caps from soil and what lies on it is not what tells caps from stems.
-LOW = 0.6  # of `height`, where the middle is 1.5 radii over the bed
 SAMPLES = 16  # directions in which the disc is sampled
 LEAST_KNOWN = 0.35  # share of the disc with depth below which depth features are off
 _TURNS = 2 * np.pi * (np.arange(SAMPLES) + 0.5) / SAMPLES
@@ -64,13 +62,6 @@ _BASIS = _BASIS[_U * _U + _V * _V <= 0.5625]
 _BY_TERM = np.ascontiguousarray(_BASIS.T)
 _PRODUCTS = np.array([_BY_TERM[p] * _BY_TERM[q] for p in range(6) for q in range(p, 6)])
 _RINGS = np.array([0.15, 0.3, 0.45, 0.6, 0.75, 0.88, 0.97])
-
-
-def kinds(table: Table, middle: Table) -> Rows:
-    """Return of candidates (N,) which are without depth, 0, with depth, 1, or low besides, 2."""
-    known = np.isfinite(middle)
-    low = known & (table[:, NAMES.index("height")] < LOW)
-    return known.astype(np.int32) + low
 
 
 @borrower

@@ -24,7 +24,7 @@ from mushpipe.stages.phase_edges import (
     gradient_of,
     otsu_of,
 )
-from mushpipe.stages.phase_features import LEARNED, NAMES, kinds, static_features
+from mushpipe.stages.phase_features import LEARNED, NAMES, static_features
 from mushpipe.stages.phase_fuse import fused
 from mushpipe.stages.phase_learned import add_discs, agreement, candidates_of
 from mushpipe.stages.phase_polish import polish
@@ -32,6 +32,7 @@ from mushpipe.stages.phase_refit import Table, refit
 from mushpipe.stages.phase_strips import Strips, in_strips
 from mushpipe.stages.phase_verifier import load_verifier
 from mushpipe.stages.phase_votes import CELL, peaks, rings_between, summed, vote
+from mushpipe.stages.verifier_net import Models
 from mushpipe.stages.warm_up import example_circles, example_frame
 
 Positive = Annotated[float, Field(gt=0)]
@@ -40,8 +41,10 @@ _FLOOR = 4.0  # gray levels per px; Otsu's threshold of an image without edges i
 _TOP = 64.0  # gray levels per px; larger gradients count as this in Otsu's threshold
 _AROUND = np.ones((7, 7), np.uint8)  # edges are taken so far around the foreground
 _STANDING = 0.004  # m; what is higher than this over the bed is looked at, in the mask or not
+_EVIDENCE = 0.07  # share of an outline that votes; half-hidden caps show hardly more
+_BESIDE = 0.14  # the same beside a network: what has less it sees as well, and fewer cost less time
 _REACH = 2  # cells around a peak within which it must be the highest
-_SEEN = 0.15  # of `learned`; without depth, what the network sees less of is no cap
+_SEEN = 0.25  # of `learned`; without depth, what the network sees less of is no cap
 _LIKELY = 0.5  # score from which on a circle is more likely a cap than not
 _SMALLEST = 12  # px; images smaller than this in either direction hold no circle
 
@@ -73,7 +76,7 @@ class PhaseHough(Stage):
     """Detects caps with the phase-coded circular Hough transform of Atherton & Kerbyson (1999).
 
     Edge points of the gray image, and of the depth image where there is one, vote for centres; each
-    peak is refitted to its edges, and a small logistic verifier over named features decides, cap by
+    peak is refitted to its edges, and a small verifier over named features decides, cap by
     cap, in the order of its probability. The score is that probability. Circles have the area of
     the outline, so a tilted cap's is between its long and its short axis.
     """
@@ -89,14 +92,16 @@ class PhaseHough(Stage):
         "beyond; null takes them from diameter_mm and depth",
     )
     diameter_mm: tuple[Positive, Positive] = Field(
-        (8.0, 120.0), description="smallest and largest diameter, mm, where there is depth"
+        (6.0, 120.0), description="smallest and largest diameter, mm, where there is depth"
     )
     min_score: float = Field(0.5, ge=0, le=1, description="smallest score that is kept")
     edge: float = Field(
         0.25, gt=0, le=2, description="least gradient, in units of Otsu's threshold of gradients"
     )
-    evidence: float = Field(
-        0.07, ge=0.01, le=1, description="least share of an outline that votes, for a candidate"
+    evidence: Annotated[float, Field(ge=0.01, le=1)] | None = Field(
+        None,
+        description="least share of an outline that votes, for a candidate; not set: 0.07, and "
+        "0.14 with use_learned, where circles of the network are candidates as well",
     )
     use_depth: bool = Field(True, description="false ignores depth")
     use_blobs: bool = Field(
@@ -107,7 +112,7 @@ class PhaseHough(Stage):
     )
     verifier: GraphPath | None = Field(None, description="another verifier than the package's")
 
-    _weights: Table | None = PrivateAttr(None)
+    _models: Models | None = PrivateAttr(None)
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -171,7 +176,8 @@ class PhaseHough(Stage):
         cells = vote(
             edges, rings_between(smallest, largest), (-(-height // CELL), -(-width // CELL))
         )
-        found = peaks(*summed(cells), self.evidence, smallest, largest, _REACH)
+        evidence = self.evidence or (_EVIDENCE if learned is None else _BESIDE)
+        found = peaks(*summed(cells), evidence, smallest, largest, _REACH)
         if learned is not None:
             found = np.concatenate([found, candidates_of(learned, smallest, largest)])
         if relief is not None and self.use_blobs:
@@ -191,17 +197,17 @@ class PhaseHough(Stage):
     def decide(self, found: Evidence) -> tuple[Rows, Table, Rows]:
         """Return the accepted rows in their order, all probabilities, and whose each edge is."""
         # Where no circle of the other detector lies, it has nothing to say.
-        asked = (found.table[:, NAMES.index(LEARNED)] > 0).astype(np.int32)
-        model = kinds(found.table, found.middle) + 3 * asked
+        asked = found.table[:, NAMES.index(LEARNED)] > 0
+        which = np.isfinite(found.middle).astype(np.int32) + 2 * asked
         return decide(
-            found.edges, found.shapes, found.hits, found.table, model, self._load(), self.min_score
+            found.edges, found.shapes, found.hits, found.table, which, self._load(), self.min_score
         )
 
-    def _load(self) -> Table:
-        """Return the weights of all models, read once."""
-        if self._weights is None:
-            self._weights = load_verifier(self.verifier).stacked(self.input == "mask")
-        return self._weights
+    def _load(self) -> Models:
+        """Return the models, read once."""
+        if self._models is None:
+            self._models = load_verifier(self.verifier, self.input == "mask")
+        return self._models
 
     def _range(self, relief: Relief | None, height: int, width: int) -> tuple[float, float]:
         """Return the smallest and largest radius, px, no larger than the image."""

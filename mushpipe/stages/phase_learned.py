@@ -17,9 +17,13 @@ _AROUND = 4.0  # px; a circle of a network is not more exact than that
 
 
 def candidates_of(learned: Circles, smallest: float, largest: float) -> Plane:
-    """Return the circles of a radius (px) within the range as candidates (N, 4) for a refit."""
+    """Return circles as candidates (N, 4) for a refit: those of a radius (px) within the range.
+
+    Radii of a network are no more exact than a tenth, by which outlines may be beyond as well.
+    """
     rows = np.column_stack([learned.center, learned.radius, learned.score]).astype(np.float32)
-    within: NDArray[np.bool_] = (learned.radius >= smallest) & (learned.radius <= largest)
+    radius = learned.radius
+    within: NDArray[np.bool_] = (radius >= 0.9 * smallest) & (radius <= 1.1 * largest)
     return rows[within]
 
 

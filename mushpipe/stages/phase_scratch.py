@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import jit
-from mushpipe.stages.phase_edges import Plane, Rows
+from mushpipe.stages.phase_edges import Plane, Rows, Singles
+from mushpipe.stages.verifier_net import WIDTHS
 
 DIRECTIONS = 96  # in which an outline is looked at, at most
+FIRST, SECOND = WIDTHS
 
 
 class Scratch(NamedTuple):
@@ -24,6 +26,8 @@ class Scratch(NamedTuple):
         lanes: (2, DIRECTIONS) of whatever has a number per direction.
         a: (5, 5) normal matrix.
         b: (5,) its right side.
+        first: (H,) hidden units of a verifier.
+        second: (K,) those of its next layer.
     """
 
     rows: Rows
@@ -33,6 +37,8 @@ class Scratch(NamedTuple):
     lanes: Plane
     a: NDArray[np.float64]
     b: NDArray[np.float64]
+    first: Singles
+    second: Singles
 
 
 @jit
@@ -40,4 +46,6 @@ def scratch_for(count: int) -> Scratch:
     """Return room to work in with so many edge points."""
     rows, lanes = np.empty((2, count), np.int32), np.empty((2, DIRECTIONS), np.int32)
     planes = np.empty((2, DIRECTIONS), np.float32)
-    return Scratch(rows[0], rows[1], lanes[0], lanes[1], planes, np.empty((5, 5)), np.empty(5))
+    first, second = np.empty(FIRST, np.float32), np.empty(SECOND, np.float32)
+    a, b = np.empty((5, 5)), np.empty(5)
+    return Scratch(rows[0], rows[1], lanes[0], lanes[1], planes, a, b, first, second)

@@ -17,7 +17,7 @@ from mushpipe.core.errors import UsageError
 
 Floats = NDArray[np.float64]
 COLUMNS = ("mean", "scale", "weight", "square")
-LIMIT = 2.5  # of a standardised feature: beyond the scenes of the training it says no more
+LIMIT = 4.0  # of a standardised feature: beyond the scenes of the training it says no more
 _EXPECTED = "expected a file as `make verifier` writes it"
 
 

@@ -99,6 +99,19 @@ def test_features_of_what_was_not_fitted_are_unknown_and_its_score_stays() -> No
     assert np.array_equal(chances(circles, fits)[~fits.valid], circles.score[~fits.valid])
 
 
+def test_features_tell_how_far_a_cap_leans_and_how_wrong_the_size_of_its_circle_was() -> None:
+    depth, gray, circles = scene()
+    frame = frame_from(depth, gray)
+    wrong = Circles(circles.center[:4], circles.radius[:4] * [1.1, 1, 0.9, 1], circles.score[:4])
+    fits = CapFit(up="camera").fit(frame.gray, frame.depth_m, CAMERA, wrong)
+    columns = dict(zip(NAMES, features(wrong, fits).T, strict=True))
+    assert np.degrees(columns["lean"]) == pytest.approx([10, 20, 0, 15], abs=5)
+    moved = np.log(fits.circle[:, 2] / wrong.radius)
+    assert columns["resized"] == pytest.approx(np.abs(moved))
+    assert (moved[[0, 2]] * [-1, 1] > 0.03).all()
+    assert (columns["resized"][[1, 3]] < 0.03).all()
+
+
 def test_a_surer_detector_never_makes_a_cap_less_likely() -> None:
     depth, gray, circles = scene()
     frame = frame_from(depth, gray)

@@ -1,33 +1,29 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mushpipe import Mask
-from mushpipe.core.errors import UsageError
 from mushpipe.stages.bed import far_cells, fit_plane, plane_depth
 from mushpipe.stages.discs import lens
-from mushpipe.stages.phase_decide import outline_features, overlap_features, probability
+from mushpipe.stages.phase_decide import outline_features, overlap_features
 from mushpipe.stages.phase_depth import GRID, closed, halved, relief_of
 from mushpipe.stages.phase_edges import edges_of, gradient_of, otsu_of
 from mushpipe.stages.phase_features import (
     DEPTH_FEATURES,
     IMAGE_FEATURES,
+    LEARNED,
     NAMES,
-    kinds,
     static_features,
 )
 from mushpipe.stages.phase_hough import PhaseHough, equal_area_radius
 from mushpipe.stages.phase_refit import DIRECTIONS, HIDDEN, directions_of
 from mushpipe.stages.phase_scratch import scratch_for
 from mushpipe.stages.phase_strips import Strips, in_strips
-from mushpipe.stages.phase_verifier import Verifier, load_verifier
+from mushpipe.stages.phase_verifier import load_verifier
 from mushpipe.stages.phase_votes import GAP, peaks, phase_of, rings_between, summed, vote
-from mushpipe.stages.verifier import weights_of
 from tests.stages.scenes import discs, frame_of, sphere_depth
 
 ALL = np.ones((120, 160), np.uint8)
@@ -239,52 +235,15 @@ def test_small_gaps_close_at_the_lower_end_and_wide_ones_stay() -> None:
     assert (out[:, 20:35] == -1).all()
 
 
-def test_the_probability_is_the_logistic_of_the_weighted_features() -> None:
-    model = {
-        "intercept": -0.5,
-        "features": {"support": {"mean": 0.5, "scale": 0.25, "weight": 1.0, "square": -0.2}},
-    }
-    row = np.zeros(len(NAMES))
-    row[NAMES.index("support")] = 0.75
-    logit = -0.5 + 1.0 * 1 - 0.2 * 1
-    assert probability(row, weights_of(model, NAMES)) == pytest.approx(1 / (1 + math.exp(-logit)))
-
-
-def test_the_verifier_of_the_package_names_known_features_only() -> None:
-    verifier = load_verifier()
-    first_depth = len(IMAGE_FEATURES)
-    for weights in (verifier.image, verifier.mask):
-        assert not weights[first_depth:-1, 2:].any()
-    for weights in (verifier.depth, verifier.low):
-        assert weights[first_depth:-1, 2:].any()
-        assert np.isfinite(weights).all()
-        assert (weights[:, 1] > 0).all()
-
-
-def test_candidates_are_of_a_kind_by_what_depth_says_of_them() -> None:
-    table, middle = np.zeros((4, len(NAMES))), np.array([np.nan, 0.04, 0.02, -0.01])
-    # h / (|h| + R) of R = 20 mm
-    table[:, NAMES.index("height")] = [0.0, 0.04 / 0.06, 0.02 / 0.04, -0.01 / 0.03]
-    assert kinds(table, middle).tolist() == [0, 1, 2, 2]
-
-
-def test_a_verifier_with_an_unknown_feature_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "verifier.yaml"
-    model = "{intercept: 0, features: {luck: {mean: 0, scale: 1, weight: 1, square: 0}}}"
-    names = [field.name for field in fields(Verifier)]
-    path.write_text(f"models: {{{', '.join(f'{name}: {model}' for name in names)}}}")
-    with pytest.raises(UsageError, match=r"unknown features \['luck'\]"):
-        load_verifier(path)
-
-
-@pytest.mark.parametrize("text", ["models: {}", "foo: 1", "", "[1, 2", "models: 3", "a: \xff"])
-def test_a_file_that_is_no_verifier_is_refused(text: str, tmp_path: Path) -> None:
-    path = tmp_path / "mine.yaml"
-    path.write_bytes(text.encode("latin-1"))
-    with pytest.raises(UsageError, match=r"mine\.yaml: .*; expected a file as `make verifier`"):
-        load_verifier(path)
-    with pytest.raises(UsageError, match=r"none\.yaml: No such file"):
-        load_verifier(tmp_path / "none.yaml")
+def test_the_verifier_of_the_package_asks_of_depth_only_where_there_is_some() -> None:
+    first_depth, learned = len(IMAGE_FEATURES), NAMES.index(LEARNED)
+    for literal in (False, True):
+        models = load_verifier(literal=literal)
+        asked = np.any(models.w1 != 0, axis=2) | (models.a != 0) | (models.s != 0)
+        assert not asked[[0, 2], first_depth:learned].any()
+        assert asked[[1, 3], first_depth:learned].all()
+        assert asked[:, learned].tolist() == [False, False, True, True]
+        assert (models.scale > 0).all()
 
 
 def test_every_candidate_has_all_features_and_a_probability() -> None:

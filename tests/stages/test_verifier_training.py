@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from mushpipe import Circles
 from mushpipe.core.truth import INSTANCES_TOPIC, TRUTH_TOPIC
+from mushpipe.stages.verifier_net import LIMIT, WIDTHS, probability, read_models, write_models
 from tests.stages.frames import simulated
 from training.fitted import labels
 from training.harder import harder
+from training.logistic import fit
 from training.matching import counted
 from training.net.scenes import cap_mask
 from training.scenes import Case
 from training.sensors import worse
-from training.verifier import NET, RADII, doubtful, fit
+from training.verifier import FEATURES, NET, RADII, doubtful, first_guess, fit_logistic, fit_network
 
 
 def test_a_doubtful_network_finds_fewer_circles_with_lower_scores_and_no_others() -> None:
@@ -79,8 +83,40 @@ def test_only_some_features_are_squared() -> None:
     right = (rng.random(4000) < 1 / (1 + np.exp(-(0.5 + x[:, 0] - 0.8 * x[:, 1] ** 2)))).astype(
         float
     )
-    model = fit(x, right, ("one", "two"), 1e-6, ("two",))
+    model = fit(x, right, ("one", "two"), 1e-6, LIMIT, ("two",))
     one, two = model["features"]["one"], model["features"]["two"]
     assert one["weight"] == pytest.approx(1, abs=0.15)
     assert one["square"] == 0
     assert two["square"] == pytest.approx(-0.8, abs=0.15)
+
+
+def test_a_network_learns_what_no_regression_on_squares_can(tmp_path: Path) -> None:
+    rng, names = np.random.default_rng(0), ("support", "free")
+    x = rng.normal(0, 1, (6000, 2))
+    right = (x[:, 0] * x[:, 1] > 0).astype(float)
+    path = tmp_path / "models.npz"
+    models = {"net": fit_network(x, right, 0), "plain": fit_logistic(x, right, names)}
+    write_models(path, {name: (names, parts) for name, parts in models.items()})
+    both = read_models(path, list(models), names)
+    room = np.empty(WIDTHS[0], np.float32), np.empty(WIDTHS[1], np.float32)
+    fresh = rng.normal(0, 1, (1000, 2))
+    agrees = [
+        np.mean([(probability(row, both, k, *room) > 0.5) == (row.prod() > 0) for row in fresh])
+        for k in range(2)
+    ]
+    assert agrees[0] > 0.95
+    assert agrees[1] < 0.6
+
+
+def test_the_first_guess_of_every_model_likes_edges_and_dislikes_overlap(tmp_path: Path) -> None:
+    path = tmp_path / "models.npz"
+    write_models(path, {name: (known, first_guess(known)) for name, known in FEATURES.items()})
+    room = np.empty(WIDTHS[0], np.float32), np.empty(WIDTHS[1], np.float32)
+    for name, known in FEATURES.items():
+        models = read_models(path, [name], known)
+        row = np.full(len(known), 0.5)
+        edge, hidden = row.copy(), row.copy()
+        edge[known.index("support")] = hidden[known.index("overlap")] = 1.0
+        chance = [probability(each, models, 0, *room) for each in (hidden, row, edge)]
+        assert chance == sorted(chance)
+        assert chance[0] < chance[1] < chance[2]

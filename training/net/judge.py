@@ -1,7 +1,7 @@
 """Judge `cap-net` beside the classic detector, on what trained neither.
 
-`python -m training.net.judge` prints simulated scenes of both shape families by condition, and
-with `--field FOLDER` labelled real recordings.
+`python -m training.net.judge` prints simulated scenes of both shape families by condition, with
+`--choosing` those for choices of design, and with `--field FOLDER` labelled real recordings.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from mushpipe.stages.phase_hough import PhaseHough
 from training import judge
 from training.field import RANGES, labelled, result
 from training.matching import Score, counted
-from training.net.scenes import varied_cases
-from training.scenes import judging_cases
+from training.net.scenes import CHOOSING_SEED, JUDGING_SEED, varied_cases
+from training.scenes import Case, choosing_cases, judging_cases
 from training.verifier import NET, RADII, segmentations
 
 CLASSIC = {
@@ -36,11 +36,18 @@ FITTED = {  # down to a low score, for `cap-fit` to decide
 }
 
 
-def simulated(models: list[Path], cache: Path, peers: bool) -> str:
+def scenes(cache: Path, choosing: bool) -> Iterator[Case]:
+    """Yield the frames to judge on, or those for choices of design."""
+    if choosing:
+        return chain(choosing_cases(cache), varied_cases(cache, CHOOSING_SEED, "a", 60))
+    return chain(judging_cases(cache), varied_cases(cache, JUDGING_SEED, "b", 16))
+
+
+def simulated(models: list[Path], cases: Iterator[Case], peers: bool) -> str:
     """Return the table of all models; with `peers`, of the classic detector too."""
     nets = {path.stem: CapNet(radius_px=RADII, model=path) for path in models}
     scores: dict[tuple[str, str], Score] = defaultdict(Score)
-    for case in chain(judging_cases(cache), varied_cases(cache, "b", 16)):
+    for case in cases:
         counts = counted(case.truth, *RADII)
         for name, net in nets.items():
             scores[case.condition, name].add(net.process(case.frame)[1], case.truth, counts)
@@ -90,13 +97,15 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, default=Path("out/scenes"), help="rendered frames")
     parser.add_argument("--models", type=Path, nargs="+", default=[shipped])
     parser.add_argument("--peers", action="store_true", help="the classic detector as well")
+    parser.add_argument("--choosing", action="store_true", help="the frames for choices of design")
     parser.add_argument("--field", type=Path, help="labelled real recordings instead")
     arguments = parser.parse_args()
     if arguments.field:
         for line in real(arguments.models[0], arguments.field):
             print(line)
     else:
-        print(simulated(arguments.models, arguments.cache, arguments.peers))
+        cases = scenes(arguments.cache, arguments.choosing)
+        print(simulated(arguments.models, cases, arguments.peers))
 
 
 if __name__ == "__main__":

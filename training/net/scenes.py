@@ -20,7 +20,8 @@ from mushpipe.sources.synthetic import SyntheticSource
 from training.scenes import Case, stored
 
 Floats = NDArray[np.float64]
-TRAINING_SEED, VALIDATION_SEED, JUDGING_SEED, VERIFIER_SEED = 200_000, 300_000, 400_000, 500_000
+TRAINING_SEED, VALIDATION_SEED, JUDGING_SEED = 200_000, 300_000, 400_000
+VERIFIER_SEED, CHOOSING_SEED = 500_000, 510_000  # family a
 TRAINING, VALIDATION = 640, 60
 
 
@@ -139,9 +140,8 @@ def pictures(first: int, count: int, cache: Path) -> Iterator[Picture]:
         yield picture(seed, cache)
 
 
-def varied_cases(cache: Path, family: Literal["a", "b"], count: int) -> Iterator[Case]:
-    """Yield as varied frames with depth: family a for training a verifier, b for judging only."""
-    first = VERIFIER_SEED if family == "a" else JUDGING_SEED
+def varied_cases(cache: Path, first: int, family: Literal["a", "b"], count: int) -> Iterator[Case]:
+    """Yield as varied frames with depth, of `count` seeds from `first` on."""
     for seed in range(first, first + count):
         drawn = settings(seed) | {"shape_family": family}
         yield stored(cache / f"varied-{family}-{seed}.pickle", "varied", drawn)
