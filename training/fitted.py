@@ -24,7 +24,7 @@ from training.harder import harder
 from training.logistic import Floats, fit, write
 from training.matching import counted, matched
 from training.net.scenes import VERIFIER_SEED, varied_cases
-from training.scenes import training_cases
+from training.scenes import more_cases, training_cases
 from training.verifier import NET, RADII, VARIED, segmentations
 
 LEAST = 0.1  # score
@@ -56,8 +56,9 @@ def labels(circles: Circles, truth: Truth) -> Floats:
 def samples(cache: Path) -> tuple[Floats, Floats]:
     """Return features (N, F) and labels (N,) of all circles whose fit decides, flat ones aside."""
     stage, rng = CapFit(), np.random.default_rng(7)
+    varied = varied_cases(cache, VERIFIER_SEED, "a", VARIED)
     rows, right = [], []
-    for case in chain(training_cases(cache), varied_cases(cache, VERIFIER_SEED, "a", VARIED)):
+    for case in chain(training_cases(cache), more_cases(cache), varied):
         for frame in (case.frame, harder(case, rng).frame):
             if frame.camera is None or frame.depth is None:
                 continue

@@ -48,10 +48,12 @@ CONDITIONS: dict[str, dict[str, Any]] = {
 # How many frames of each condition a training run takes, seeds from 0 on.
 TRAINING = {
     "even": 8, "gradient": 5, "dense": 8, "brown": 6, "tilted": 8, "mixed": 4, "cream": 2,
-    "side": 3, "spot": 2, "harsh": 4, "near": 6, "far": 3, "oblique": 4, "lab": 8, "cloth": 4,
-    "paint": 4, "empty": 3, "bare": 10, "fallen": 6, "wood": 8,
-    "low": 8, "lids": 8,
+    "side": 3, "spot": 2, "harsh": 4, "near": 4, "far": 3, "oblique": 4, "lab": 4, "cloth": 2,
+    "paint": 2, "empty": 3, "bare": 3, "fallen": 6, "wood": 6,
+    "low": 8, "lids": 6,
 }  # fmt: skip
+# How many more of them, for what can learn from rare scenes without forgetting the usual ones.
+MORE = {"near": 2, "lab": 4, "cloth": 2, "paint": 2, "bare": 7, "wood": 2, "lids": 2}
 CHOOSING = {
     "even": 3, "gradient": 3, "dense": 3, "brown": 3, "tilted": 4, "harsh": 2, "near": 1,
     "oblique": 1, "lab": 2, "empty": 1, "bare": 1, "fallen": 2, "wood": 2,
@@ -96,6 +98,13 @@ def training_cases(cache: Path) -> Iterator[Case]:
     """Yield the frames that the verifier is trained on."""
     for number, (condition, count) in enumerate(TRAINING.items()):
         for k in range(count):
+            yield render(condition, "a", 20 * number + k, cache)
+
+
+def more_cases(cache: Path) -> Iterator[Case]:
+    """Yield more frames for training, as `MORE` says."""
+    for number, (condition, count) in enumerate(TRAINING.items()):
+        for k in range(count, count + MORE.get(condition, 0)):
             yield render(condition, "a", 20 * number + k, cache)
 
 

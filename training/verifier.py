@@ -12,9 +12,8 @@ import argparse
 import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,17 +40,18 @@ from training import logistic
 from training.harder import harder, stained
 from training.matching import IOU
 from training.net.scenes import VERIFIER_SEED, varied_cases
-from training.scenes import Case, training_cases
+from training.scenes import Case, more_cases, training_cases
 
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 Parts = dict[str, Floats]  # of a model, as in `verifier_net.Models`
 RADII = (8.0, 45.0)
-Prepared = tuple[Case, RgbdFrame, Mask, Circles | None]
-VARIED = 140  # frames
+VARIED, FEW = 140, 20  # varied frames, and how many of them regressions learn from
 BETTER = 0.15  # of IoU; less gained nothing on scenes that chose nothing
 NET = CapNet(radius_px=RADII, min_score=0.05)  # what it is unsure of is for the verifier to decide
 RIDGE = 1e-3  # per candidate
 DECAY = 1e-4  # of a network's weights
+TEACHERS = 5
 SCHEDULE = ((20, 2e-3), (10, 2.5e-4))  # passes over the candidates, and the rate of learning
 # How to detect, and which model learns from it.
 PASSES: tuple[tuple[dict[str, Any], str], ...] = (
@@ -72,6 +72,24 @@ FEATURES = {
 RIGHT, WRONG = (Ignore.AT_BORDER, Ignore.TOO_LARGE), (Ignore.CUT_STUMP,)
 
 
+class Prepared(NamedTuple):
+    """A frame as the detector gets it.
+
+    Attributes:
+        case: The frame, with its truth.
+        frame: The frame, perhaps flattened.
+        mask: Where caps may be.
+        learned: Circles of `cap-net`.
+        usual: Whether regressions learn from it, too.
+    """
+
+    case: Case
+    frame: RgbdFrame
+    mask: Mask
+    learned: Circles | None
+    usual: bool
+
+
 def segmentations(frame: RgbdFrame) -> list[tuple[RgbdFrame, Mask]]:
     """Return the frame as two chains of stages hand it to the detector."""
     opening, flat = Opening(), Flatten().process(frame)
@@ -90,17 +108,15 @@ def prepared(cache: Path) -> Iterator[Prepared]:
     `stained` frame and on a `harder` one.
     """
     rng, other = np.random.default_rng(0), np.random.default_rng(1)
-    for clean in chain(training_cases(cache), varied_cases(cache, VERIFIER_SEED, "a", VARIED)):
+    varied = list(varied_cases(cache, VERIFIER_SEED, "a", VARIED))
+    usual = [*training_cases(cache), *varied[:FEW]]
+    for k, clean in enumerate([*usual, *more_cases(cache), *varied[FEW:]]):
         for case in (clean, stained(clean, other), harder(clean, other)):
             for frame, mask in segmentations(case.frame):
-                yield case, frame, mask, None
-            yield from _beside(case, rng)
-
-
-def _beside(case: Case, rng: np.random.Generator) -> Iterator[Prepared]:
-    mask, circles = NET.process(case.frame)
-    yield case, case.frame, mask, circles
-    yield case, case.frame, mask, doubtful(circles, rng)
+                yield Prepared(case, frame, mask, None, k < len(usual))
+            mask, circles = NET.process(case.frame)
+            for found in (circles, doubtful(circles, rng)):
+                yield Prepared(case, case.frame, mask, found, k < len(usual))
 
 
 def doubtful(circles: Circles, rng: np.random.Generator) -> Circles:
@@ -142,7 +158,7 @@ def labels(case: Case, circles: Circles, order: NDArray[np.intp]) -> Floats:
 def samples(stage: PhaseHough, cases: Iterable[Prepared], deep: bool) -> tuple[Floats, Floats]:
     """Return features (N, F) and labels (N,) of the candidates with depth, or of those without."""
     rows, right = [np.zeros((0, len(NAMES)))], [np.zeros(0)]
-    for case, frame, mask, learned in cases:
+    for case, frame, mask, learned, _ in cases:
         found = stage.gather(replace(frame), mask, learned)  # what a frame caches takes room
         if found is None or not len(found.shapes):
             continue
@@ -163,25 +179,46 @@ def fit_logistic(features: Floats, right: Floats, names: tuple[str, ...]) -> Par
     return parts | {"b3": np.array([model["intercept"]])}
 
 
-def fit_network(features: Floats, right: Floats, seed: int) -> Parts:
+def fit_network(features: Floats, right: Floats, teachers: int = 0) -> Parts:
     """Return a network that learnt from features (N, F) and labels (N,).
 
-    Without class weights its probability is calibrated on the scenes of the training. The rate of
-    learning drops once, so that the last steps settle.
+    With teachers it learns as much from the mean of so many networks as from the labels (Hinton,
+    Vinyals & Dean 2015, arXiv 1503.02531): single networks differ where the training says little,
+    and so on real frames. Without class weights its probability is calibrated on the scenes of the
+    training.
+    """
+    mean, scale = features.mean(axis=0), np.maximum(features.std(axis=0), 1e-3)
+    z = np.clip((features - mean) / scale, -LIMIT, LIMIT).astype(np.float32)
+    if teachers:
+        logits = [_logits(_trained(z, right, seed), z) for seed in range(teachers)]
+        right = (right + expit(np.mean(logits, axis=0))) / 2
+    return {"mean": mean, "scale": scale, **_trained(z, right, 0)}
+
+
+def _trained(z: Singles, chance: Floats, seed: int) -> Parts:
+    """Return what a network learnt of which chances (N,) belong to features (N, F).
+
+    The rate of learning drops once, so that the last steps settle.
     """
     from sklearn.neural_network import MLPClassifier
 
-    mean, scale = features.mean(axis=0), np.maximum(features.std(axis=0), 1e-3)
-    z = np.clip((features - mean) / scale, -LIMIT, LIMIT).astype(np.float32)
     net = MLPClassifier(WIDTHS, alpha=DECAY, batch_size=512, warm_start=True, random_state=seed)
+    doubted = (chance > 0) & (chance < 1)  # such a row is both, with weights
+    rows = np.concatenate([z, z[doubted]])
+    label = np.concatenate([chance > 0, np.zeros(doubted.sum(), bool)])
+    weight = np.concatenate([np.where(chance > 0, chance, 1), 1 - chance[doubted]])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that it has not converged after so many passes
         for passes, rate in SCHEDULE:
             net.set_params(max_iter=passes, learning_rate_init=rate)
-            net.fit(z, right)
+            net.fit(rows, label, sample_weight=weight)
     (w1, w2, w3), (b1, b2, b3) = net.coefs_, net.intercepts_
-    return {"mean": mean, "scale": scale, "w1": w1, "b1": b1, "w2": w2, "b2": b2, "w3": w3[:, 0],
-            "b3": b3}  # fmt: skip
+    return {"w1": w1, "b1": b1, "w2": w2, "b2": b2, "w3": w3[:, 0], "b3": b3}
+
+
+def _logits(parts: Parts, z: Singles) -> Floats:
+    hidden = np.maximum(0, np.maximum(0, z @ parts["w1"] + parts["b1"]) @ parts["w2"] + parts["b2"])
+    return np.asarray(hidden @ parts["w3"] + parts["b3"])
 
 
 def first_guess(names: tuple[str, ...]) -> Parts:
@@ -191,8 +228,8 @@ def first_guess(names: tuple[str, ...]) -> Parts:
     return {"mean": np.full(len(a), 0.5), "scale": np.ones(len(a)), "a": a, "b3": np.zeros(1)}
 
 
-def train(cache: Path, out: Path, rounds: int, seed: int) -> None:
-    """Train all models and write them.
+def train(cache: Path, out: Path, rounds: int) -> None:
+    """Train all models and write them; networks have teachers in the last round.
 
     Discs from depth alone are left out: hardly any is a cap that no edges voted for, and learning
     from them cost 0.1 to 0.2 points of F on the frames for choosing.
@@ -206,8 +243,11 @@ def train(cache: Path, out: Path, rounds: int, seed: int) -> None:
             deep, known = name.startswith("depth"), FEATURES[name]
             table, right = samples(stage, [case for case in cases if teaches(case, name)], deep)
             rows = table[:, [NAMES.index(each) for each in known]]
-            fitted = fit_network(rows, right, seed) if deep else fit_logistic(rows, right, known)
-            models[name] = known, fitted
+            if deep:
+                teachers = TEACHERS if turn == rounds - 1 else 0
+                models[name] = known, fit_network(rows, right, teachers)
+            else:
+                models[name] = known, fit_logistic(rows, right, known)
             print(f"round {turn + 1}, {name}: {len(rows)} candidates", flush=True)
             write_models(out, models)
 
@@ -215,11 +255,13 @@ def train(cache: Path, out: Path, rounds: int, seed: int) -> None:
 def teaches(case: Prepared, name: str) -> bool:
     """Return whether a model learns from a frame: those beside `cap-net` from frames that have it.
 
-    Without depth and network a varied bed teaches a regression little but doubt.
+    A regression has a few dozen weights: what it learns from rare scenes it loses on usual ones.
+    Without depth and network a varied bed teaches it little but doubt.
     """
-    beside = case[3] is not None
-    varied = case[0].condition == "varied"
-    return beside == name.endswith("learned") and (name not in ("image", "mask") or not varied)
+    if (case.learned is not None) != name.endswith("learned"):
+        return False
+    varied = case.case.condition == "varied"
+    return name.startswith("depth") or (case.usual and (name == "image_learned" or not varied))
 
 
 def main() -> None:
@@ -227,10 +269,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cache", type=Path, default=Path("out/scenes"), help="rendered frames")
     parser.add_argument("--out", type=Path, default=Path(f"mushpipe/stages/{FILE}"))
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--rounds", type=int, default=4)
     arguments = parser.parse_args()
-    train(arguments.cache, arguments.out, arguments.rounds, arguments.seed)
+    train(arguments.cache, arguments.out, arguments.rounds)
 
 
 if __name__ == "__main__":
