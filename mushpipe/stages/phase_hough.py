@@ -198,7 +198,7 @@ class PhaseHough(Stage):
         """Return the accepted rows in their order, all probabilities, and whose each edge is."""
         # Where no circle of the other detector lies, it has nothing to say.
         asked = found.table[:, NAMES.index(LEARNED)] > 0
-        which = np.isfinite(found.middle).astype(np.int32) + 2 * asked
+        which = (np.isfinite(found.middle) + 2 * asked).astype(np.int32)
         return decide(
             found.edges, found.shapes, found.hits, found.table, which, self._load(), self.min_score
         )
