@@ -45,6 +45,16 @@ def test_the_mask_is_where_the_caps_are() -> None:
     assert iou(mask.foreground, caps) > 0.75
 
 
+def test_circles_may_be_a_tenth_beyond_the_range() -> None:
+    frame = first("dense")
+    _, wide = CapNet(radius_px=(8, 45)).process(frame)
+    smallest = float(np.median(wide.radius))
+    _, found = CapNet(radius_px=(smallest, 45)).process(frame)
+    kept = wide.radius >= 0.9 * smallest
+    assert np.array_equal(found.radius, wide.radius[kept])
+    assert found.radius.min() < smallest
+
+
 def test_a_range_of_larger_caps_is_met_by_scaling_the_image() -> None:
     frame = first("first-bed")
     size = (2 * frame.color.shape[1], 2 * frame.color.shape[0])

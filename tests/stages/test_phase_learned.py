@@ -24,9 +24,25 @@ def test_agreement_is_score_times_shared_area() -> None:
     assert agreement(shapes, shapes[:, 2], circles()).tolist() == [0, 0, 0]
 
 
-def test_candidates_are_the_circles_of_the_range() -> None:
-    learned = circles((50, 40, 7, 0.9), (60, 41, 20, 0.3), (70, 42, 50, 0.9))
-    assert candidates_of(learned, 8, 45) == pytest.approx(np.array([[60, 41, 20, 0.3]]))
+def test_candidates_are_the_circles_of_the_range_and_a_tenth_beyond() -> None:
+    rows = [(50.0, 40.0, radius, 0.5) for radius in (7.1, 7.3, 20.0, 49.0, 50.0)]
+    assert candidates_of(circles(*rows), 8, 45) == pytest.approx(np.array(rows[1:4]))
+
+
+def test_beside_a_network_less_of_an_outline_makes_no_candidate_unless_it_is_asked_for() -> None:
+    image = discs([(40, 60, 15), (62, 60, 14)], 0.8, 0.15)
+    mask, nothing = Mask(image > 0.5), circles()
+
+    def outlines(learned: Circles | None, **settings: float) -> int:
+        found = PhaseHough.model_validate(settings).gather(frame_of(image), mask, learned)
+        return 0 if found is None else len(found.hits)
+
+    asked = PhaseHough(use_depth=False)
+    assert asked.evidence is None
+    few, many = outlines(nothing, evidence=0.9), outlines(None, evidence=0.01)
+    assert few < many
+    assert outlines(None) == outlines(None, evidence=0.07)
+    assert outlines(nothing) == outlines(nothing, evidence=0.14)
 
 
 def test_discs_are_added_to_the_foreground_also_across_the_border() -> None:
