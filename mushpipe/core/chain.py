@@ -136,8 +136,8 @@ def cores_shared() -> Iterator[None]:
     # A stage that comes back from a kernel asks for the interpreter, and would wait for the 5 ms
     # that Python gives a sink by default.
     sys.setswitchinterval(5e-4)
-    # What was made until now stays: 200 000 objects of libraries, which a full collection would look
-    # through in the first seconds and now and then later, for 40 to 130 ms in which no thread runs.
+    # What was made until now stays: 200 000 objects of libraries that a full collection would look
+    # through in the first seconds, and seldom later, for 40 to 130 ms in which no thread runs.
     gc.freeze()
     # The cores are busy with stages and sinks; OpenCV's own threads would only spin beside them.
     cv2.setNumThreads(1)
