@@ -1,23 +1,26 @@
 """Make the verifier of `cap-fit` from simulated scenes: `python -m training.fitted`.
 
 Circles of `phase-hough`, alone and beside `cap-net`, down to a low score, are fitted, in depth as
-it was simulated and in worse, and labelled by the simulator's truth.
+it was simulated and in worse, and labelled by the simulator's truth; so are those of the image
+alone, without a fit.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mushpipe import Circles, RgbdFrame
 from mushpipe.core.truth import Truth
 from mushpipe.evaluate.matching import circle_iou
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_verify import MODEL, NAMES, features, flat
+from mushpipe.stages.cap_kin import unlike
+from mushpipe.stages.cap_verify import FILE, FIT, MODELS, NAMES, features, flat
 from mushpipe.stages.phase_hough import PhaseHough
 from mushpipe.stages.verifier import LIMIT
 from training.harder import harder
@@ -29,19 +32,22 @@ from training.verifier import NET, RADII, VARIED, segmentations
 
 LEAST = 0.1  # score
 NEUTRAL = 0.3  # IoU with a mushroom that need not be found, from which on a circle teaches nothing
-ALONE = PhaseHough(radius_px=RADII, min_score=LEAST)
-BESIDE = PhaseHough(radius_px=RADII, min_score=LEAST, use_learned=True)
+ALONE, BESIDE = {}, {"use_learned": True}
+SETTINGS = [{**net, "use_depth": deep} for deep in (True, False) for net in (ALONE, BESIDE)]
+STAGES = [PhaseHough(radius_px=RADII, min_score=LEAST, **each) for each in SETTINGS]
 HEAD = """\
-# The verifier of the stage `cap-fit`: a logistic regression over what the fit found, made by
-# `make verifier` from simulated scenes alone. A feature x (docs/detection.md says what each is)
-# adds  weight z + square z^2  to the logit, with z = (x - mean) / scale, clipped to -4..4.
+# The verifier of the stage `cap-fit`: logistic regressions over what the fit found and over how
+# like other caps a circle looks, made by `make verifier` from simulated scenes alone. A feature x
+# (docs/detection.md says what each is) adds  weight z + square z^2  to the logit, with
+# z = (x - mean) / scale, clipped to -4..4.
 """
 
 
-def detected(frame: RgbdFrame) -> Iterator[Circles]:
-    """Yield the circles of the detector alone, and beside the network."""
-    yield ALONE.process(*segmentations(frame)[0])
-    yield BESIDE.process(frame, *NET.process(frame))
+def detected(frame: RgbdFrame) -> Iterator[tuple[Circles, bool]]:
+    """Yield the circles of the detector alone and beside the network, and whether with depth."""
+    alone, beside = segmentations(frame)[0], (frame, *NET.process(frame))
+    for stage in STAGES:
+        yield stage.process(*(beside if stage.use_learned else alone)), stage.use_depth
 
 
 def labels(circles: Circles, truth: Truth) -> Floats:
@@ -54,7 +60,7 @@ def labels(circles: Circles, truth: Truth) -> Floats:
 
 
 def samples(cache: Path) -> tuple[Floats, Floats]:
-    """Return features (N, F) and labels (N,) of all circles whose fit decides, flat ones aside."""
+    """Return features (N, F) and labels (N,) of all circles that a model decides about."""
     stage, rng = CapFit(), np.random.default_rng(7)
     varied = varied_cases(cache, VERIFIER_SEED, "a", VARIED)
     rows, right = [], []
@@ -62,27 +68,41 @@ def samples(cache: Path) -> tuple[Floats, Floats]:
         for frame in (case.frame, harder(case, rng).frame):
             if frame.camera is None or frame.depth is None:
                 continue
-            for circles in detected(frame):
-                if not len(circles):
-                    continue
-                fits = stage.fit(frame.gray, frame.depth_m, frame.camera, circles)
-                label = labels(circles, case.truth)
-                use = fits.valid & ~flat(fits) & np.isfinite(label)
-                rows.append(features(circles, fits)[use])
+            for circles, deep in detected(frame):
+                fits = stage.fit(frame.gray, frame.depth_m, frame.camera, circles) if deep else None
+                use = np.isfinite(label := labels(circles, case.truth))
+                if fits is not None:
+                    use &= fits.valid & ~flat(fits)
+                rows.append(features(circles, unlike(frame.color, circles), fits)[use])
                 right.append(label[use])
     return np.concatenate(rows), np.concatenate(right)
+
+
+def teaches(rows: Floats, names: Sequence[str]) -> NDArray[np.bool_]:
+    """Return which rows (N, F) teach a model over some features: those of which it is asked.
+
+    What is fitted is for the models of fits, and all others for the one without.
+    """
+    fitted = np.isfinite(rows[:, NAMES.index(FIT[0])])
+    use = fitted if FIT[0] in names else ~fitted
+    return np.asarray(use & np.isfinite(rows[:, [NAMES.index(name) for name in names]]).all(axis=1))
 
 
 def main() -> None:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cache", type=Path, default=Path("out/scenes"), help="rendered frames")
-    parser.add_argument("--out", type=Path, default=Path(f"mushpipe/stages/{MODEL}.yaml"))
+    parser.add_argument("--out", type=Path, default=Path(f"mushpipe/stages/{FILE}"))
     parser.add_argument("--ridge", type=float, default=1e-3)
     arguments = parser.parse_args()
     rows, right = samples(arguments.cache)
-    write({MODEL: fit(rows, right, NAMES, arguments.ridge, LIMIT, ())}, arguments.out, HEAD)
-    print(f"{len(right)} circles, {right.mean():.2f} right")
+    models = {}
+    for model, names in MODELS.items():
+        use = teaches(rows, names)
+        table = rows[use][:, [NAMES.index(name) for name in names]]
+        models[model] = fit(table, right[use], names, arguments.ridge, LIMIT, ())
+        print(f"{model}: {len(table)} circles, {right[use].mean():.2f} right")
+    write(models, arguments.out, HEAD)
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from mushpipe import (
 )
 from mushpipe.core.geometry import lengths
 from mushpipe.stages.cap_batch import Fits, fit_caps
+from mushpipe.stages.cap_kin import unlike
 from mushpipe.stages.cap_order import Order, by_depth
 from mushpipe.stages.cap_solve import Noise
 from mushpipe.stages.cap_verify import chances
@@ -39,7 +40,8 @@ class CapFit(Stage):
     they cover. Over a hole at the centre the position is that of `surface-fit`. Where tilt cannot
     be seen the sigma says so. A mushroom with hardly any depth is ``missing`` and has no pose.
     Circles are handed on improved: drawn to the outline of the fitted cap where the image shows
-    little of it. With `min_score` the fit decides, too, which of them are caps.
+    little of it. With `min_score` it decides, too, which of them are caps: by their fits, and by
+    how they look beside the others, for which it needs no depth.
     """
 
     up: Up = "bed"
@@ -63,8 +65,9 @@ class CapFit(Stage):
         None,
         ge=0,
         le=1,
-        description="renew the scores of phase-hough by what the fits tell, and leave out circles "
-        "below this one; null keeps all, with their scores",
+        description="renew the scores of phase-hough by what the fits tell and by how like the "
+        "sure caps circles look, and leave out those below this one; null keeps all, with their "
+        "scores",
     )
 
     def open(self) -> None:
@@ -78,7 +81,9 @@ class CapFit(Stage):
             InputError: The frame has depth but no calibration.
         """
         if frame.depth is None or not len(circles):
-            return self._kept(Locations.unknown(len(circles)), Poses.unknown(len(circles)), circles)
+            unknown = Locations.unknown(len(circles)), Poses.unknown(len(circles))
+            scored = Circles(circles.center, circles.radius, self._scores(frame, circles))
+            return self._kept(*unknown, scored)
         if frame.camera is None:
             raise InputError(
                 "depth cannot be turned into metres without the camera's calibration: record "
@@ -87,13 +92,18 @@ class CapFit(Stage):
         depth = frame.depth_m
         order = by_depth(depth, discs_of(circles))
         fits = self.fit(frame.gray, depth, frame.camera, circles, order)
-        score = circles.score if self.min_score is None else chances(circles, fits)
+        score = self._scores(frame, circles, fits)
         circles = Circles(fits.circle[:, :2], fits.circle[:, 2], score)
         source = np.where(fits.valid, sources(circles, depth), DepthSource.MISSING)
         holes = np.flatnonzero(source == DepthSource.NEIGHBOURS)
         if len(holes):
             self._bridge(holes, fits, depth, frame.camera, circles, order)
         return self._kept(_locations(fits, source.astype(np.uint8)), _poses(fits), circles)
+
+    def _scores(self, frame: RgbdFrame, circles: Circles, fits: Fits | None = None) -> Floats:
+        if self.min_score is None:
+            return circles.score
+        return chances(circles, unlike(frame.color, circles), fits)
 
     def _kept(
         self, locations: Locations, poses: Poses, circles: Circles

@@ -25,6 +25,7 @@ from mushpipe.stages.cap_decode import (
     circles_of,
     first_of_each,
 )
+from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE
 from mushpipe.stages.letterbox import resized
 
 FILE = "cap_net.onnx"
@@ -118,7 +119,8 @@ class CapNet(Stage):
         """Return which circles (N, 3) are within the range, their centres within the image."""
         x, y, radius = circles.T
         inside = (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
-        sized = (radius >= 0.9 * self.radius_px[0]) & (radius <= 1.1 * self.radius_px[1])
+        smallest, largest = self.radius_px
+        sized = (radius >= LEAST_OF_RANGE * smallest) & (radius <= MOST_OF_RANGE * largest)
         return np.asarray(inside & sized)
 
     def _maps(self, color: NDArray[np.uint8]) -> Maps:

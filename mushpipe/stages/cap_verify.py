@@ -1,8 +1,9 @@
-"""Whether a fitted circle is a cap: a logistic regression over what the fit found.
+"""Whether a circle is a cap, by what a detector could not know when it found it.
 
-A detector decides before anything is fitted. How well a spheroid fits, how surely it leans as it
-does, whether its form is a cap's and its place the circle's says more: stones, stems, paper and
-parts of caps seldom fit. The weights stand in `fitted.yaml`; `training/fitted.py` makes them.
+How well a spheroid fits, how surely it leans as it does, whether its form is a cap's and its place
+the circle's: stones, stems, paper and parts of caps seldom fit. And whether it looks like the caps
+around it: clods do not. The logistic regressions stand in `fitted.yaml`; `training/fitted.py` makes
+them.
 """
 
 from __future__ import annotations
@@ -17,29 +18,38 @@ from mushpipe.stages.cap_batch import Fits
 from mushpipe.stages.verifier import package_file, probability, read_models
 
 Floats = NDArray[np.float64]
-MODEL = "fitted"
-FILE = f"{MODEL}.yaml"
+FILE = "fitted.yaml"
 ROUND = 0.6  # height over radius; a rounder cap is no more, and no less, likely one
 # Flatter than any cap in the training scenes: lids, cups upside down, paper and cut stumps. It is a
 # rule because a regression over standardised features gives rare ones little weight.
 FLAT = 0.15  # height over radius
 FLAT_CHANCE = 0.01  # of 127 that flat in the training scenes none was a cap
-NAMES = ("score", "misfit", "tilt", "aspect", "moved", "resized", "lean")
+FIT = ("misfit", "tilt", "aspect", "moved", "resized", "lean")
+NAMES = ("score", *FIT, "unlike")
+# What is known decides which model is asked; each is over some of these features.
+MODELS = {"fitted": NAMES[:-1], "fitted_kin": NAMES, "seen_kin": ("score", "unlike")}
 
 
-def features(circles: Circles, fits: Fits) -> Floats:
-    """Return the features (N, F) in the order of `NAMES`; NaN where nothing was fitted.
+def features(circles: Circles, unlike: Floats, fits: Fits | None = None) -> Floats:
+    """Return the features (N, F) in the order of `NAMES`; NaN where they are not known.
 
     Logit of the score; log of the misfit over the median in view, since what fits how well depends
     on the sensor; log of the sigma of the tilt, rad; height over radius, up to `ROUND`; how far the
     fit moves the circle, in its radii; log of how much larger or smaller it makes it; how far the
-    axis leans off the upright, rad.
+    axis leans off the upright, rad; how unlike the sure caps it is (`cap_kin`).
     """
     score = np.clip(circles.score, 1e-4, 1 - 1e-4)
-    usual = max(np.median(fits.misfit[fits.valid]), 1e-6) if fits.valid.any() else 1.0
-    table = np.column_stack(
+    table = np.full((len(circles), len(NAMES)), np.nan)
+    table[:, 0], table[:, -1] = np.log(score / (1 - score)), unlike
+    if fits is not None and fits.valid.any():
+        table[fits.valid, 1:-1] = _of_fits(circles, fits)[fits.valid]
+    return table
+
+
+def _of_fits(circles: Circles, fits: Fits) -> Floats:
+    usual = max(np.median(fits.misfit[fits.valid]), 1e-6)
+    return np.column_stack(
         [
-            np.log(score / (1 - score)),
             np.log(np.clip(fits.misfit / usual, 0.1, 10)),
             np.log(np.clip(fits.sigma_tilt, 0.02, 3)),
             np.clip(fits.height / fits.radius, 0.2, ROUND),
@@ -48,8 +58,6 @@ def features(circles: Circles, fits: Fits) -> Floats:
             fits.lean,
         ]
     )
-    table[~fits.valid] = np.nan
-    return table
 
 
 def flat(fits: Fits) -> NDArray[np.bool_]:
@@ -57,20 +65,28 @@ def flat(fits: Fits) -> NDArray[np.bool_]:
     return np.asarray(fits.valid & (fits.height < FLAT * fits.radius))
 
 
-def chances(circles: Circles, fits: Fits) -> Floats:
-    """Return the probability (N,) of each circle to be a cap; its score where nothing was fitted.
+def chances(circles: Circles, unlike: Floats, fits: Fits | None = None) -> Floats:
+    """Return the probability (N,) of each circle to be a cap.
 
-    One whose fit is flat has `FLAT_CHANCE` at most.
+    It is what the fit tells, or the score where nothing was fitted; less where the circle looks
+    unlike the sure caps. That it looks like them is no reason to believe in it: stems do, too.
+    What was fitted as flat has `FLAT_CHANCE` at most.
 
     Args:
         circles: As detected, with the scores of `phase-hough`.
-        fits: Of these circles.
+        unlike: (N,) how unlike the sure caps they are, NaN where that is not known.
+        fits: Of these circles, if there is depth.
     """
-    chance = probability(features(circles, fits), _weights())
-    chance = np.where(flat(fits), np.minimum(chance, FLAT_CHANCE), chance)
-    return np.where(fits.valid, chance, circles.score)
+    table = np.nan_to_num(features(circles, unlike, fits))
+    model = {name: probability(table, weights) for name, weights in _models().items()}
+    chance, beside = circles.score, model["seen_kin"]
+    if fits is not None:
+        chance = np.where(fits.valid, model["fitted"], chance)
+        chance = np.where(flat(fits), np.minimum(chance, FLAT_CHANCE), chance)
+        beside = np.where(fits.valid, model["fitted_kin"], beside)
+    return np.where(np.isfinite(unlike), np.minimum(chance, beside), chance)
 
 
 @lru_cache(maxsize=1)
-def _weights() -> Floats:
-    return read_models(package_file(FILE), [MODEL], NAMES)[MODEL]
+def _models() -> dict[str, Floats]:
+    return read_models(package_file(FILE), list(MODELS), NAMES)

@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 from mushpipe.core.jit import borrower
 from mushpipe.core.tables import Circles
 
+# Radii are no more exact than a tenth: by so much an outline may be beyond a range of radii.
+LEAST_OF_RANGE, MOST_OF_RANGE = 0.9, 1.1
+
 
 def discs_of(circles: Circles) -> NDArray[np.float64]:
     """Return x, y and radius (N, 3), px."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mushpipe import Circles
 from mushpipe.core.jit import borrower, jit
-from mushpipe.stages.discs import iou
+from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE, iou
 from mushpipe.stages.phase_edges import Plane
 from mushpipe.stages.phase_refit import Table
 
@@ -17,14 +17,10 @@ _AROUND = 4.0  # px; a circle of a network is not more exact than that
 
 
 def candidates_of(learned: Circles, smallest: float, largest: float) -> Plane:
-    """Return circles as candidates (N, 4) for a refit: those of a radius (px) within the range.
-
-    Radii of a network are no more exact than a tenth, by which outlines may be beyond as well.
-    """
+    """Return circles as candidates (N, 4) for a refit: those of a radius (px) within the range."""
     rows = np.column_stack([learned.center, learned.radius, learned.score]).astype(np.float32)
-    radius = learned.radius
-    within: NDArray[np.bool_] = (radius >= 0.9 * smallest) & (radius <= 1.1 * largest)
-    return rows[within]
+    enough = learned.radius >= LEAST_OF_RANGE * smallest
+    return np.asarray(rows[enough & (learned.radius <= MOST_OF_RANGE * largest)])
 
 
 def add_discs(learned: Circles, foreground: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import borrower, jit
+from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE
 from mushpipe.stages.linear import solve
 from mushpipe.stages.phase_edges import Plane, Rows, Shape, Singles
 from mushpipe.stages.phase_scratch import DIRECTIONS, Scratch, scratch_for
@@ -183,7 +184,7 @@ def refit(
             tried += 1
             if not fit_around(edges, height, pixel, shape, NARROW, scratch):
                 continue
-            within = smallest * 0.9 <= shape[2] <= largest * 1.1
+            within = smallest * LEAST_OF_RANGE <= shape[2] <= largest * MOST_OF_RANGE
             if not within or _known(shape, shapes, cells[NARROW], following[NARROW]):
                 continue
             n, near = directions_of(shape[2]), tolerance(shape[2])

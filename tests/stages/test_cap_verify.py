@@ -20,6 +20,9 @@ CAPS = [
 ]
 
 
+UNKNOWN = np.full(6, np.nan)  # how alike they look
+
+
 def scene() -> tuple[np.ndarray, np.ndarray, Circles]:
     """Four caps, then a tilted board and a pile of clods that look like discs of 22 px."""
     depth, gray = draw(CAPS, BED)
@@ -92,11 +95,26 @@ def test_features_of_what_was_not_fitted_are_unknown_and_its_score_stays() -> No
     frame = frame_from(depth, gray)
     fits = CapFit(up="camera").fit(frame.gray, frame.depth_m, CAMERA, circles)
     assert fits.valid.tolist() == [False, False, True, True, False, False]
-    table = features(circles, fits)
+    table = features(circles, UNKNOWN, fits)
     assert table.shape == (6, len(NAMES))
-    assert np.isnan(table[~fits.valid]).all()
-    assert np.isfinite(table[fits.valid]).all()
-    assert np.array_equal(chances(circles, fits)[~fits.valid], circles.score[~fits.valid])
+    assert np.isnan(table[~fits.valid, 1:]).all()
+    assert np.isfinite(table[fits.valid, :-1]).all()
+    assert np.isnan(table[:, -1]).all()
+    assert np.array_equal(chances(circles, UNKNOWN, fits)[~fits.valid], circles.score[~fits.valid])
+    assert np.array_equal(chances(circles, UNKNOWN), circles.score)
+
+
+def test_what_looks_unlike_the_sure_caps_is_less_likely_one_and_likeness_is_no_reason() -> None:
+    depth, gray, circles = scene()
+    depth[:, :200] = np.nan
+    frame = frame_from(depth, gray)
+    fits = CapFit(up="camera").fit(frame.gray, frame.depth_m, CAMERA, circles)
+    for some in (fits, None):
+        alone = chances(circles, UNKNOWN, some)
+        beside = [chances(circles, np.full(6, far), some) for far in np.linspace(0, 6, 13)]
+        assert (beside <= alone).all()
+        assert (np.diff(beside, axis=0) <= 0).all()
+        assert (beside[-1] < alone).all()
 
 
 def test_features_tell_how_far_a_cap_leans_and_how_wrong_the_size_of_its_circle_was() -> None:
@@ -104,7 +122,7 @@ def test_features_tell_how_far_a_cap_leans_and_how_wrong_the_size_of_its_circle_
     frame = frame_from(depth, gray)
     wrong = Circles(circles.center[:4], circles.radius[:4] * [1.1, 1, 0.9, 1], circles.score[:4])
     fits = CapFit(up="camera").fit(frame.gray, frame.depth_m, CAMERA, wrong)
-    columns = dict(zip(NAMES, features(wrong, fits).T, strict=True))
+    columns = dict(zip(NAMES, features(wrong, UNKNOWN[:4], fits).T, strict=True))
     assert np.degrees(columns["lean"]) == pytest.approx([10, 20, 0, 15], abs=5)
     moved = np.log(fits.circle[:, 2] / wrong.radius)
     assert columns["resized"] == pytest.approx(np.abs(moved))
@@ -117,7 +135,7 @@ def test_a_surer_detector_never_makes_a_cap_less_likely() -> None:
     frame = frame_from(depth, gray)
     fits = CapFit(up="camera").fit(frame.gray, frame.depth_m, CAMERA, circles)
     chance = [
-        chances(Circles(circles.center, circles.radius, np.full(6, score)), fits)
+        chances(Circles(circles.center, circles.radius, np.full(6, score)), UNKNOWN, fits)
         for score in np.linspace(0, 1, 21)
     ]
     assert (np.diff(chance, axis=0) >= 0).all()

@@ -10,6 +10,7 @@ import argparse
 import json
 from collections import defaultdict
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
@@ -30,9 +31,12 @@ CLASSIC = {
     "image+net": PhaseHough(radius_px=RADII, use_depth=False, use_learned=True),
     "depth+net": PhaseHough(radius_px=RADII, use_learned=True),
 }
-FITTED = {  # down to a low score, for `cap-fit` to decide
+FITTED = {  # down to a low score, for `cap-fit` to decide; at last without depth
     "fitted": PhaseHough(radius_px=RADII, min_score=judge.LEAST),
     "fitted+net": PhaseHough(radius_px=RADII, min_score=judge.LEAST, use_learned=True),
+    "seen+net": PhaseHough(
+        radius_px=RADII, min_score=judge.LEAST, use_depth=False, use_learned=True
+    ),
 }
 
 
@@ -58,7 +62,8 @@ def simulated(models: list[Path], cases: Iterator[Case], peers: bool) -> str:
                 circles = stage.process(*seen[stage.use_learned])
                 scores[case.condition, name].add(circles, case.truth, counts)
             for name, stage in FITTED.items():
-                circles = judge.kept(case.frame, stage.process(*seen[stage.use_learned]))
+                frame = case.frame if stage.use_depth else replace(case.frame, depth=None)
+                circles = judge.kept(frame, stage.process(*seen[stage.use_learned]))
                 scores[case.condition, name].add(circles, case.truth, counts)
     return judge.table(scores, [*nets, *((*CLASSIC, *FITTED) if peers else ())])
 
@@ -66,10 +71,9 @@ def simulated(models: list[Path], cases: Iterator[Case], peers: bool) -> str:
 def both(frame: RgbdFrame, depth: bool) -> Circles:
     """Return the circles of network and classic detector, as graphs/pick.yaml has them."""
     net = CapNet(radius_px=(8, 60), min_score=0.05)
-    least = judge.LEAST if depth else 0.5
-    stage = PhaseHough(radius_px=(8, 80), min_score=least, use_learned=True, use_depth=depth)
-    circles = stage.process(frame, *net.process(frame))
-    return judge.kept(frame, circles) if depth else circles
+    frame = frame if depth else replace(frame, depth=None)
+    stage = PhaseHough(radius_px=(8, 80), min_score=judge.LEAST, use_learned=True)
+    return judge.kept(frame, stage.process(frame, *net.process(frame)))
 
 
 def real(model: Path, folder: Path) -> Iterator[str]:

@@ -1,0 +1,110 @@
+"""How unlike circles are to the caps in view: clods among caps, whatever the light."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mushpipe import Circles, RgbdFrame
+from mushpipe.core.types import Header
+from mushpipe.stages.cap_fit import CapFit
+from mushpipe.stages.cap_kin import DARK, FEWEST, MOST, USUAL, unlike
+
+HEIGHT, WIDTH, RADIUS = 240, 320, 9.0
+CAP, CLOD, SOIL = np.array([190.0, 180, 165]), np.array([60.0, 45, 35]), np.array([40.0, 30, 25])
+
+
+def circles_of(count: int, score: Any = 0.95) -> Circles:
+    """Circles in rows, far enough apart."""
+    place = np.arange(count)
+    center = np.column_stack([25 + 30.0 * (place % 10), 25 + 30.0 * (place // 10)])
+    return Circles(center, np.full(count, RADIUS), np.broadcast_to(score, count))
+
+
+def bed(circles: Circles, tones: Any, light: Any = 1.0) -> np.ndarray:
+    """Discs of a colour each (N, 3) on soil, under light (H, W) or a number."""
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    color = np.broadcast_to(SOIL, (HEIGHT, WIDTH, 3)).copy()
+    for (x, y), tone in zip(circles.center, np.broadcast_to(tones, (len(circles), 3)), strict=True):
+        color[np.hypot(u - x, v - y) < RADIUS] = tone
+    color *= light if np.isscalar(light) else np.asarray(light)[..., None]
+    return np.clip(np.rint(color), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("exposure", [0.3, 1.0])
+def test_a_clod_among_caps_is_unlike_them_and_caps_are_not(exposure: float) -> None:
+    circles = circles_of(30)
+    tones = np.tile(CAP, (30, 1))
+    tones[[4, 17]] = CLOD
+    found = unlike(bed(circles, tones, exposure), circles)
+    assert (found[[4, 17]] > 3).all()
+    assert (np.delete(found, [4, 17]) < 0.2).all()
+
+
+def test_a_white_cup_among_brown_caps_is_as_unlike_as_the_other_way_round() -> None:
+    circles = circles_of(20)
+    tones = np.tile(CLOD + 30, (20, 1))
+    tones[7] = 230
+    found = unlike(bed(circles, tones), circles)
+    assert found[7] > 3
+    assert (np.delete(found, 7) < 0.2).all()
+
+
+def test_light_that_falls_off_across_the_bed_makes_no_cap_unlike() -> None:
+    circles = circles_of(60)
+    light = np.exp(np.linspace(0, -1.2, WIDTH))[None].repeat(HEIGHT, axis=0)
+    tones = np.tile(CAP, (60, 1))
+    tones[22] = CLOD
+    found = unlike(bed(circles, tones, light), circles)
+    assert found[22] > 2
+    assert (np.delete(found, 22) < 0.5).all()
+
+
+def test_where_caps_differ_much_a_difference_tells_less() -> None:
+    circles, rng = circles_of(40), np.random.default_rng(0)
+    clod = np.arange(40) == 11
+    even = np.where(clod[:, None], CLOD, CAP)
+    mixed = np.where(clod[:, None], CLOD, CAP * np.exp(rng.uniform(-1.2, 0, (40, 1))))
+    alike, among = (unlike(bed(circles, tones), circles)[clod][0] for tones in (even, mixed))
+    assert among < 0.6 * alike
+
+
+@given(st.integers(FEWEST, 40), st.floats(0.02, 1.0))
+def test_it_is_the_departure_in_units_of_the_usual_spread(count: int, shade: float) -> None:
+    """Equal caps and one doubtful circle of another brightness: a closed form."""
+    circles = circles_of(count + 1, np.append(np.full(count, 0.95), 0.4))
+    tones = np.tile(CAP, (count + 1, 1))
+    tones[-1] = np.rint(CAP * shade)
+    found = unlike(bed(circles, tones), circles)
+    r, g, b = np.log(tones[-1] + DARK) - np.log(CAP + DARK)
+    expected = np.sqrt(np.mean((np.array([(r + g + b) / 3, r - g, b - g]) / USUAL) ** 2))
+    assert found[-1] == pytest.approx(min(expected, MOST), abs=1e-6)
+    assert found[:-1] == pytest.approx(0, abs=1e-6)
+
+
+def test_too_few_sure_caps_tell_nothing_and_circles_beyond_the_image_do_no_harm() -> None:
+    few = circles_of(30, np.append(np.full(FEWEST - 1, 0.95), np.full(31 - FEWEST, 0.89)))
+    assert np.isnan(unlike(bed(few, CAP), few)).all()
+    none = Circles(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+    assert len(unlike(bed(none, np.zeros((0, 3))), none)) == 0
+    circles = circles_of(8)
+    outside = Circles(np.vstack([circles.center, [[-50, 500]]]), np.full(9, RADIUS), np.ones(9))
+    assert np.isfinite(unlike(bed(circles, CAP), outside)).all()
+
+
+def test_without_depth_a_clod_goes_caps_stay_and_no_score_rises() -> None:
+    clod = np.arange(30) == 9
+    circles = circles_of(30, np.where(clod, 0.7, 0.93))
+    tones = np.tile(CAP, (30, 1))
+    tones[clod] = CLOD
+    frame = RgbdFrame(Header(1, 0, "camera"), bed(circles, tones))
+    locations, poses, found = CapFit(min_score=0.5).process(frame, circles)
+    assert len(found) == len(locations) == len(poses) == 29
+    assert np.array_equal(found.center, circles.center[~clod])
+    assert (found.score <= 0.93).all()
+    kept = CapFit().process(frame, circles)[2]
+    assert np.array_equal(kept.score, circles.score)
