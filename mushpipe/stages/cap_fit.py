@@ -19,7 +19,7 @@ from mushpipe import (
 )
 from mushpipe.core.geometry import lengths
 from mushpipe.stages.cap_batch import Fits, fit_caps
-from mushpipe.stages.cap_kin import unlike
+from mushpipe.stages.cap_kin import FEWEST, unlike
 from mushpipe.stages.cap_order import Order, by_depth
 from mushpipe.stages.cap_solve import Noise
 from mushpipe.stages.cap_verify import chances
@@ -72,7 +72,9 @@ class CapFit(Stage):
 
     def open(self) -> None:
         """Compile the kernels, and read the verifier if it is asked."""
-        self.process(example_frame(), example_circles())
+        frame, circles = example_frame(), example_circles()
+        self.process(frame, circles)
+        unlike(frame.color, circles.take(np.zeros(FEWEST, np.intp)))
 
     def process(self, frame: RgbdFrame, circles: Circles) -> tuple[Locations, Poses, Circles]:
         """Return one location and one pose per circle, and the circles, improved.

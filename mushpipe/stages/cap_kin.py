@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mushpipe import Circles
 from mushpipe.core.jit import borrower, jit
+from mushpipe.core.tables import locked
 from mushpipe.stages.discs import discs_of
 from mushpipe.stages.linear import solve
 
@@ -45,7 +46,8 @@ def unlike(color: NDArray[np.uint8], circles: Circles) -> Floats:
     if sure.sum() < FEWEST:
         return np.full(len(circles), np.nan)
     tones = np.empty((len(circles), 3))
-    _tones(color, discs_of(circles), tones)
+    # read-only as a frame's: to the compiler another type, and another kernel
+    _tones(locked(color, np.uint8), discs_of(circles), tones)
     half = np.array([color.shape[1], color.shape[0]]) / 2
     departures = _departures(tones, circles.center / half - 1, sure.astype(np.float64), USUAL)
     return np.minimum(departures, MOST)

@@ -9,9 +9,10 @@ import pytest
 
 from mushpipe import Circles
 from mushpipe.core.truth import INSTANCES_TOPIC, TRUTH_TOPIC
+from mushpipe.stages.cap_verify import MODELS, NAMES
 from mushpipe.stages.verifier_net import LIMIT, WIDTHS, probability, read_models, write_models
 from tests.stages.frames import simulated
-from training.fitted import labels
+from training.fitted import labels, teaches
 from training.harder import harder
 from training.logistic import fit
 from training.matching import counted
@@ -31,6 +32,20 @@ def test_a_doubtful_network_finds_fewer_circles_with_lower_scores_and_no_others(
     assert less.score.min() >= NET.min_score
     before = np.array([told[tuple(place)] for place in less.center])
     assert less.score.mean() < before.mean() - 0.05
+
+
+def test_a_circle_teaches_the_models_that_would_be_asked_about_it() -> None:
+    known = {  # fit, likeness -> models
+        (True, True): ["fitted", "fitted_kin"],
+        (True, False): ["fitted"],
+        (False, True): ["seen_kin"],
+        (False, False): [],
+    }
+    rows = np.zeros((len(known), len(NAMES)))
+    for row, (fitted, alike) in zip(rows, known, strict=True):
+        row[1:-1], row[-1] = 0.0 if fitted else np.nan, 0.0 if alike else np.nan
+    for model, names in MODELS.items():
+        assert teaches(rows, names).tolist() == [model in models for models in known.values()]
 
 
 def test_a_cap_teaches_one_circle_and_what_need_not_be_found_teaches_none() -> None:
