@@ -1,8 +1,8 @@
 """How unlike circles are, in colour, to those that are surely caps.
 
-Mushrooms in view are of one kind. A clod among white caps may have the form of one, and is as dark
-as the soil; how bright a cap is against the soil says nothing of that, for it differs from bed to
-bed, and so does the light across an image.
+Mushrooms in view are of a kind, or of a few. A clod among white caps may have the form of one, and
+is as dark as the soil; how bright a cap is against the soil says nothing of that, for it differs
+from bed to bed.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from mushpipe import Circles
 from mushpipe.core.jit import borrower, jit
 from mushpipe.core.tables import locked
 from mushpipe.stages.discs import discs_of
-from mushpipe.stages.linear import solve
 
 Floats = NDArray[np.float64]
 SURE = 0.9  # score of what is surely a cap
@@ -25,32 +24,32 @@ WITHIN = 0.6  # of the radius: what lies there is no rim and no neighbour
 STEPS = 15  # samples across that
 DARK = 4.0  # gray levels that are added, since the darkest ones are noise
 MOST = 6.0
-# Spread among sure caps that says nothing: of the log of brightness, of red and blue over green.
+# Differences between caps of a kind: of the log of brightness, of red and blue over green.
 USUAL = np.array([0.2, 0.08, 0.08])
-STEEP = 0.4  # spread of the residual over that of the slope of light, per half of an image
-ROUNDS = 6
+KIN = 3  # so many sure caps like it, and this share of them, are its kind
+SHARE = 0.1
 
 
 def unlike(color: NDArray[np.uint8], circles: Circles) -> Floats:
-    """Return how unlike each circle (N,) is to the sure ones, 0 to `MOST`; NaN where those are few.
+    """Return how unlike each circle (N,) is to its kind, 0 to `MOST`; NaN where few are sure.
 
-    Brightness, and red and blue over green, as logarithms: a plane through those of the sure
-    circles (light differs across the image), by least squares with the weights of Geman & McClure
-    (1987). A difference counts in units of their spread about it, which `USUAL` bounds below.
+    Its distance to the `KIN`th nearest of the sure circles, or to the nearest tenth of them if
+    those are more: the root mean square over brightness, red over green and blue over green of the
+    differences of their logarithms, in units of `USUAL`.
 
     Args:
         color: (H, W, 3) RGB.
         circles: As detected, with the scores of `phase-hough`.
     """
-    sure = circles.score >= SURE
-    if sure.sum() < FEWEST:
+    sure = np.flatnonzero(circles.score >= SURE)
+    if len(sure) < FEWEST:
         return np.full(len(circles), np.nan)
     tones = np.empty((len(circles), 3))
     # read-only as a frame's: to the compiler another type, and another kernel
     _tones(locked(color, np.uint8), discs_of(circles), tones)
-    half = np.array([color.shape[1], color.shape[0]]) / 2
-    departures = _departures(tones, circles.center / half - 1, sure.astype(np.float64), USUAL)
-    return np.minimum(departures, MOST)
+    tones /= USUAL * np.sqrt(len(USUAL))
+    nearest = max(KIN, math.ceil(SHARE * len(sure)))
+    return np.minimum(_distances(tones, sure, nearest), MOST)
 
 
 @borrower
@@ -77,35 +76,14 @@ def _tones(color: NDArray[np.uint8], discs: Floats, tones: Floats) -> None:
 
 
 @jit
-def _departures(tones: Floats, places: Floats, sure: Floats, usual: Floats) -> Floats:
-    """Return the root mean square (N,) over tones of how far each is from the sure ones' plane."""
-    count = len(tones)
-    squares, rest, weight = np.zeros(count), np.empty(count), np.empty(count)
-    a, b, row = np.empty((3, 3)), np.empty(3), np.ones(3)
-    for channel in range(tones.shape[1]):
-        weight[:] = sure
-        spread = 0.0
-        for _ in range(ROUNDS):
-            _plane(tones[:, channel], places, weight, a, b, row)
-            for k in range(count):
-                rest[k] = tones[k, channel] - b[0] - b[1] * places[k, 0] - b[2] * places[k, 1]
-            spread = 1.4826 * np.median(np.abs(rest[sure > 0]))
-            for k in range(count):
-                weight[k] = sure[k] / (1 + (rest[k] / (2 * spread + 0.1)) ** 2) ** 2
-        squares += rest**2 / (spread**2 + usual[channel] ** 2)
-    return np.asarray(np.sqrt(squares / tones.shape[1]))
-
-
-@borrower
-def _plane(tone: Floats, places: Floats, weight: Floats, a: Floats, b: Floats, row: Floats) -> None:
-    """Write the plane b (3,) through the tones (N,) at places (N, 2), its slopes kept small."""
-    a[:] = 0.0
-    b[:] = 0.0
-    a[1, 1] = a[2, 2] = STEEP**2
-    for k in range(len(tone)):
-        row[1], row[2] = places[k, 0], places[k, 1]
-        for i in range(3):
-            b[i] += weight[k] * row[i] * tone[k]
-            for j in range(3):
-                a[i, j] += weight[k] * row[i] * row[j]
-    solve(a, b)
+def _distances(tones: Floats, sure: NDArray[np.int64], nearest: int) -> Floats:
+    """Return how far each (N,) is from the so many nearest of the sure ones, itself aside."""
+    found, away = np.empty(len(tones)), np.empty(len(sure))
+    for k in range(len(tones)):
+        for m in range(len(sure)):
+            squares = 0.0
+            for tone in range(tones.shape[1]):
+                squares += (tones[k, tone] - tones[sure[m], tone]) ** 2
+            away[m] = np.inf if sure[m] == k else math.sqrt(squares)
+        found[k] = np.partition(away, nearest - 1)[nearest - 1]
+    return found

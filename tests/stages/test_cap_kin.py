@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mushpipe import Circles, RgbdFrame
 from mushpipe.core.types import Header
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_kin import DARK, FEWEST, MOST, USUAL, unlike
+from mushpipe.stages.cap_kin import DARK, FEWEST, MOST, SURE, USUAL, unlike
 
 HEIGHT, WIDTH, RADIUS = 240, 320, 9.0
 CAP, CLOD, SOIL = np.array([190.0, 180, 165]), np.array([60.0, 45, 35]), np.array([40.0, 30, 25])
@@ -64,17 +64,48 @@ def test_light_that_falls_off_across_the_bed_makes_no_cap_unlike() -> None:
     assert (np.delete(found, 22) < 0.5).all()
 
 
-def test_where_caps_differ_much_a_difference_tells_less() -> None:
-    circles, rng = circles_of(40), np.random.default_rng(0)
-    clod = np.arange(40) == 11
-    even = np.where(clod[:, None], CLOD, CAP)
-    mixed = np.where(clod[:, None], CLOD, CAP * np.exp(rng.uniform(-1.2, 0, (40, 1))))
-    alike, among = (unlike(bed(circles, tones), circles)[clod][0] for tones in (even, mixed))
-    assert among < 0.6 * alike
+def test_caps_of_a_second_kind_have_kin_as_well_and_a_single_one_of_a_third_has_none() -> None:
+    circles = circles_of(40)
+    tones = np.tile(CAP, (40, 1))
+    tones[::5] = [130, 85, 55]  # eight brown caps among white ones
+    tones[13] = CLOD
+    found = unlike(bed(circles, tones), circles)
+    assert found[13] > 1.5
+    assert (np.delete(found, 13) < 0.2).all()
+
+
+def test_a_few_clods_that_the_detector_is_sure_of_do_not_vouch_for_each_other() -> None:
+    circles = circles_of(60)
+    tones = np.tile(CAP, (60, 1))
+    clods = [7, 21, 33, 52]
+    tones[clods] = CLOD
+    found = unlike(bed(circles, tones), circles)
+    assert (found[clods] > 3).all()
+    assert (np.delete(found, clods) < 0.2).all()
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_it_is_the_distance_to_the_nearest_tenth_of_the_sure_circles(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(FEWEST, 60))
+    circles = circles_of(count, rng.uniform(0.8, 1, count))
+    tones = rng.integers(20, 255, (count, 3)).astype(float)
+    found = unlike(bed(circles, tones), circles)
+    sure = np.flatnonzero(circles.score >= SURE)
+    if len(sure) < FEWEST:
+        assert np.isnan(found).all()
+        return
+    r, g, b = np.log(tones + DARK).T
+    place = np.column_stack([(r + g + b) / 3, r - g, b - g]) / USUAL / np.sqrt(3)
+    for k in range(count):
+        others = sure[sure != k]
+        away = np.sort(np.linalg.norm(place[others] - place[k], axis=1))
+        nearest = away[max(3, -(-len(sure) // 10)) - 1]
+        assert found[k] == pytest.approx(min(nearest, MOST), abs=1e-6)
 
 
 @given(st.integers(FEWEST, 40), st.floats(0.02, 1.0))
-def test_it_is_the_departure_in_units_of_the_usual_spread(count: int, shade: float) -> None:
+def test_it_is_the_difference_in_units_of_the_usual_one(count: int, shade: float) -> None:
     """Equal caps and one doubtful circle of another brightness: a closed form."""
     circles = circles_of(count + 1, np.append(np.full(count, 0.95), 0.4))
     tones = np.tile(CAP, (count + 1, 1))
