@@ -21,7 +21,9 @@ Floats = NDArray[np.float64]
 SURE = 0.9  # score of what is surely a cap
 FEWEST = 6  # of them: fewer do not tell what is usual
 WITHIN = 0.6  # of the radius: what lies there is no rim and no neighbour
-STEPS = 15  # samples across that
+_STEPS = np.linspace(-1, 1, 15)
+_GRID = np.stack(np.meshgrid(_STEPS, _STEPS), axis=-1).reshape(-1, 2)
+SAMPLES = WITHIN * _GRID[np.hypot(*_GRID.T) <= 1]  # (S, 2) x and y over the radius
 DARK = 4.0  # gray levels that are added, since the darkest ones are noise
 MOST = 6.0
 # Differences between caps of a kind: of the log of brightness, of red and blue over green.
@@ -57,33 +59,35 @@ def _tones(color: NDArray[np.uint8], discs: Floats, tones: Floats) -> None:
     """Write log brightness, log red over green and log blue over green of each disc (N, 3)."""
     height, width = color.shape[:2]
     for k in range(len(discs)):
-        x, y, reach = discs[k, 0], discs[k, 1], WITHIN * discs[k, 2]
-        red = green = blue = count = 0.0
-        for i in range(STEPS):
-            for j in range(STEPS):
-                across, down = 2 * i / (STEPS - 1) - 1, 2 * j / (STEPS - 1) - 1
-                if across * across + down * down > 1:
-                    continue
-                u = min(width - 1, max(0, int(x + reach * across + 0.5)))
-                v = min(height - 1, max(0, int(y + reach * down + 0.5)))
-                red += color[v, u, 0]
-                green += color[v, u, 1]
-                blue += color[v, u, 2]
-                count += 1
-        r, g = math.log(red / count + DARK), math.log(green / count + DARK)
-        b = math.log(blue / count + DARK)
+        x, y, radius = discs[k, 0] + 0.5, discs[k, 1] + 0.5, discs[k, 2]
+        red = green = blue = 0
+        for s in range(len(SAMPLES)):
+            u = min(width - 1, max(0, int(x + radius * SAMPLES[s, 0])))
+            v = min(height - 1, max(0, int(y + radius * SAMPLES[s, 1])))
+            red += color[v, u, 0]
+            green += color[v, u, 1]
+            blue += color[v, u, 2]
+        r, g = math.log(red / len(SAMPLES) + DARK), math.log(green / len(SAMPLES) + DARK)
+        b = math.log(blue / len(SAMPLES) + DARK)
         tones[k, 0], tones[k, 1], tones[k, 2] = (r + g + b) / 3, r - g, b - g
 
 
 @jit
 def _distances(tones: Floats, sure: NDArray[np.int64], nearest: int) -> Floats:
     """Return how far each (N,) is from the so many nearest of the sure ones, itself aside."""
-    found, away = np.empty(len(tones)), np.empty(len(sure))
+    found, least = np.empty(len(tones)), np.empty(nearest)  # the squares so far, in order
     for k in range(len(tones)):
-        for m in range(len(sure)):
+        least[:] = np.inf
+        for m in sure:
             squares = 0.0
             for tone in range(tones.shape[1]):
-                squares += (tones[k, tone] - tones[sure[m], tone]) ** 2
-            away[m] = np.inf if sure[m] == k else math.sqrt(squares)
-        found[k] = np.partition(away, nearest - 1)[nearest - 1]
+                squares += (tones[k, tone] - tones[m, tone]) ** 2
+            place = nearest - 1
+            if m == k or squares >= least[place]:
+                continue
+            while place > 0 and least[place - 1] > squares:
+                least[place] = least[place - 1]
+                place -= 1
+            least[place] = squares
+        found[k] = math.sqrt(least[nearest - 1])
     return found
