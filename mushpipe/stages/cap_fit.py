@@ -74,7 +74,8 @@ class CapFit(Stage):
         """Compile the kernels, and read the verifier if it is asked."""
         frame, circles = example_frame(), example_circles()
         self.process(frame, circles)
-        unlike(frame.color, circles.take(np.zeros(FEWEST, np.intp)))
+        if self.min_score is not None:
+            unlike(frame.color, circles.take(np.zeros(FEWEST, np.intp)))
 
     def process(self, frame: RgbdFrame, circles: Circles) -> tuple[Locations, Poses, Circles]:
         """Return one location and one pose per circle, and the circles, improved.
