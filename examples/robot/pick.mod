@@ -7,6 +7,7 @@ MODULE MushroomPicker
     PERS wobjdata wobj_bed := [FALSE, TRUE, "", [[0,0,0],[1,0,0,0]], [[0,0,0],[1,0,0,0]]];
     PERS tooldata tool_cup := [TRUE, [[0,0,120],[1,0,0,0]], [0.5,[0,0,60],[1,0,0,0],0,0,0]];
     CONST num MAX_AGE_MS := 200;
+    CONST num VALID_S := 0.5;   ! from the image to the moment of setting off
     VAR socketdev vision;
 
     PROC main()
@@ -28,7 +29,7 @@ MODULE MushroomPicker
         VAR string answer;
         SocketCreate vision;
         SocketConnect vision, "127.0.0.1", 5006 \Time:=3;
-        answer := Ask("HELLO,1,NAME=irb");
+        answer := Ask("HELLO,1,NAME=irb");   ! one name per robot: another robot, another name
         IF answer <> "HELLO,1,LIVE" THEN
             TPWrite "vision: " + answer;
             Stop;
@@ -72,8 +73,11 @@ MODULE MushroomPicker
         VAR orient turn;
         VAR num diameter;
         VAR num flags;
+        VAR num age;
         VAR robtarget cap;
         VAR clock asked;
+        ClkReset asked;
+        ClkStart asked;
         line := Ask("NEXT," + ValToStr(MAX_AGE_MS));
         IF Field(line) <> "T" THEN
             WaitTime 0.2;   ! NONE, or E,STALE,...: there is nothing to do now
@@ -89,12 +93,18 @@ MODULE MushroomPicker
         turn.q4 := Number(line);
         diameter := Number(line);
         flags := Number(line);
+        age := Number(line);
         IF BitAnd(flags, 4) <> 0 THEN
-            line := Ask("ACK," + id + ",REJECTED");   ! the orientation is unknown
+            line := Ask("ACK," + id + ",REJECTED,60000");   ! the orientation is unknown
             RETURN;
         ENDIF
         line := Ask("ACK," + id + ",ACCEPTED");
         IF line <> "A," + id + ",REMOVED" THEN
+            RETURN;
+        ENDIF
+        ! Asked, answered and accepted: all of that took time, and a paused program takes more.
+        IF age / 1000 + ClkRead(asked) > VALID_S THEN
+            line := Ask("ACK," + id + ",REJECTED");
             RETURN;
         ENDIF
         ! +z of the cap points out of it, the tool's +z into it: half a turn about x.

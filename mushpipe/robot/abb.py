@@ -11,7 +11,7 @@ import re
 
 from mushpipe.robot.hub import Ending, Hub, Result, ceil_ms
 from mushpipe.robot.ledger import Outcome
-from mushpipe.robot.messages import NAME, Refusal
+from mushpipe.robot.messages import LONGEST_HOLD_MS, NAME, Refusal
 from mushpipe.robot.session import Outgoing
 from mushpipe.robot.targets import Target
 
@@ -76,7 +76,9 @@ class AbbSession:
         if not re.fullmatch(NAME, said.get("NAME", "")):
             raise Refusal("bad_request", "a name is of letters, digits, _ . -", fatal=True)
         self.ready = True
-        self._owner = said.get("NAME") or self._owner
+        if said.get("NAME"):
+            self._owner = said["NAME"]
+            self._hub.name(self._owner, self)
         return f"HELLO,1,{self._source()}"
 
     def _source(self) -> str:
@@ -95,9 +97,12 @@ class AbbSession:
         return next((line for line in lines if line is not None), None)
 
     def _other(self, words: list[str], now: float) -> str:
-        if words[0] == "ACK" and len(words) == 3 and words[2] in _OUTCOMES:
-            target = _positive(words[1])
-            effect = self._hub.acknowledge(self._owner, target, _OUTCOMES[words[2]], 0.0, now)
+        if words[0] == "ACK" and len(words) in (3, 4) and words[2] in _OUTCOMES:
+            target, hold_ms = _positive(words[1]), _positive(words[3]) if len(words) > 3 else 0
+            if hold_ms > LONGEST_HOLD_MS:
+                raise Refusal("bad_request", f"a target is held for {LONGEST_HOLD_MS} ms at most")
+            outcome = _OUTCOMES[words[2]]
+            effect = self._hub.acknowledge(self._owner, target, outcome, hold_ms / 1e3, now)
             return f"A,{target},{effect.upper()}"
         if words == ["STATE"]:
             seq = self._hub.newest.seq if self._hub.newest else 0

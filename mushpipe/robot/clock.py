@@ -5,10 +5,14 @@ from __future__ import annotations
 import time
 from collections import deque
 from dataclasses import dataclass
+from math import inf
 
 MEMORY_S = 10.0
 TOLERANCE_S = 0.02
 STEP_S = 0.002
+DRIFT = (
+    2e-4  # most that two clocks drift apart; quartzes of cameras and hosts do by a quarter of it
+)
 # Time spent in suspend must age a target, too; CLOCK_MONOTONIC stands still meanwhile.
 _MONOTONIC = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
 
@@ -86,3 +90,31 @@ class Placer:
         placed = [span.place(stamp_ns / 1e9) for span in self._spans]
         found = [time_s for time_s in placed if time_s is not None]
         return min(now, *found) if found else None
+
+
+class Lateness:
+    """How late the frames of a camera arrive whose clock is its own, beyond what is usual.
+
+    The least delay so far counts as none. It may grow, as the clocks drift apart; a delay that
+    grows faster comes from a queue or from a computer that stood still.
+    """
+
+    def __init__(self) -> None:
+        self._anchor_ns, self._own_s, self._least = 0, 0.0, inf
+
+    def of(self, own_ms: float, stamp_ns: int, arrived_s: float) -> float:
+        """Return the lateness of the next frame, s.
+
+        Args:
+            own_ms: Its time on the camera's clock.
+            stamp_ns: That as ns since the epoch; another difference of the two says that the
+                camera was lost, and nothing is known of its clock any more.
+            arrived_s: Monotonic time of its arrival.
+        """
+        own_s, anchor_ns = own_ms / 1e3, stamp_ns - round(own_ms * 1e6)
+        if abs(anchor_ns - self._anchor_ns) > 1e6:
+            self._least = inf
+        delay = arrived_s - own_s
+        self._least = min(delay, self._least + DRIFT * abs(own_s - self._own_s))
+        self._anchor_ns, self._own_s = anchor_ns, own_s
+        return delay - self._least

@@ -138,7 +138,7 @@ class Connection:
             if outgoing is None:
                 line = self._take(now)
                 if line is None:
-                    if self._eof:
+                    if self._eof and not self.throttled:
                         self.abort("the client closed", reset=False)
                     return
                 outgoing = self._answer(line, now)

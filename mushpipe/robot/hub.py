@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import uuid
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
+from weakref import WeakValueDictionary
 
 import orjson
 
@@ -15,7 +17,17 @@ from mushpipe.robot.ledger import Ledger, Outcome
 from mushpipe.robot.messages import HEARTBEAT_S, PROTOCOL, VERSION, Refusal, State
 from mushpipe.robot.targets import Choice, Reason, Target
 
-Ending = Literal["end", "failed", "no_camera", "client"]
+logger = logging.getLogger("mushpipe")
+Ending = Literal["end", "failed", "no_camera", "client", "replaced"]
+
+
+class Leaving(Protocol):
+    """A session that can be ended."""
+
+    closing: bool
+
+    def leave(self, reason: Ending) -> None:
+        """End the connection after a last word."""
 
 
 @dataclass(frozen=True)
@@ -69,11 +81,22 @@ class Hub:
         self.newest: Result | None = None
         self.ending: Ending | None = None
         self._frames_read = frames_read
+        self._named: WeakValueDictionary[str, Leaving] = WeakValueDictionary()
         self._begin = clock.monotonic()
         # A source that has delivered nothing yet has not been seen to work.
         self._read = (0, self._begin - settings.stall_s)
         self._seen = 0
         self._cache: tuple[tuple[int, int, int], bytes, dict[Reason, int], bool] | None = None
+
+    def name(self, name: str, session: Leaving) -> None:
+        """Give a session a name; another one that has it ends: what is accepted goes by names."""
+        before = self._named.get(name)
+        if before is not None and not before.closing:
+            logger.warning(
+                "a robot calls itself '%s' as another connection does: that one is ended", name
+            )
+            before.leave("replaced")
+        self._named[name] = session
 
     def publish(self, choice: Choice, frame_number: int, stamp_ns: int, taken: float) -> Result:
         """Put a new result in the place of the last one."""
@@ -90,7 +113,7 @@ class Hub:
         result = self.newest
         if result is not None and result.seq != self._seen:
             self._seen = result.seq
-            self.ledger.see((target.id for target in result.choice.targets), now)
+            self.ledger.see(result.choice.seen, now)
         self.ledger.settle(now)
 
     def state(self, now: float) -> State:
@@ -197,8 +220,11 @@ class Hub:
         """Take a robot's word on a target.
 
         Raises:
-            Refusal: See `Ledger.apply`.
+            Refusal: See `Ledger.apply`; `stale` where a robot accepts a target, not one that it
+                holds already, and nobody knows any more whether it is there.
         """
+        if outcome == "accepted" and target not in self.ledger.hidden():
+            self.fresh(now, self.settings.max_age_s)
         listed = self.newest.choice.targets if self.newest else ()
         visible = any(target == known.id for known in listed)
         return self.ledger.apply(owner, target, outcome, hold_s, visible, now)

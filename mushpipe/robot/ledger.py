@@ -10,7 +10,7 @@ from typing import Literal
 from mushpipe.robot.messages import Refusal
 
 Outcome = Literal["accepted", "rejected", "done", "failed"]
-# An id out of sight for so long does not come back; its entry may go.
+# What is done and out of sight for so long does not come back; its entry may go.
 FORGET_S = 600.0
 MOST_ENTRIES = 4096
 
@@ -21,6 +21,9 @@ class _Entry:
     done: bool
     until: float
     seen: float
+
+    def ends(self) -> float:
+        return self.seen + FORGET_S if self.done else self.until
 
 
 class Ledger:
@@ -35,14 +38,14 @@ class Ledger:
         self._entries: dict[int, _Entry] = {}
 
     def settle(self, now: float) -> None:
-        """Restore what was claimed for too long."""
-        over = [key for key, e in self._entries.items() if now >= min(e.until, e.seen + FORGET_S)]
+        """Restore what was claimed or held for long enough."""
+        over = [key for key, entry in self._entries.items() if now >= entry.ends()]
         for key in over:
             del self._entries[key]
         self.version += bool(over)
 
     def see(self, ids: Iterable[int], now: float) -> None:
-        """Note which targets are visible."""
+        """Note which mushrooms are visible, targets or not."""
         for key in ids:
             if key in self._entries:
                 self._entries[key].seen = now

@@ -15,6 +15,7 @@ VERSION = "1.0"
 MAX_LINE = 65_536
 NAME = r"^[A-Za-z0-9_.-]{0,64}$"
 HEARTBEAT_S = 1.0
+LONGEST_HOLD_MS = 3_600_000
 
 
 def _whole(value: Any) -> Any:
@@ -88,7 +89,7 @@ class Ack(_Message):
     id: Id
     target: str = Field(pattern=r"^m[0-9]{1,15}$")
     result: Literal["accepted", "rejected", "done", "failed"]
-    hold_ms: Whole = Field(0, ge=0, le=3_600_000)
+    hold_ms: Whole = Field(0, ge=0, le=LONGEST_HOLD_MS)
     reason: str = Field("", max_length=200)
 
 

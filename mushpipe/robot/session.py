@@ -145,7 +145,9 @@ class JsonSession:
             raise Refusal("replay_refused", text, fatal=True)
         self.ready = True
         self._streams = hello.mode == "stream"
-        self._owner = hello.name or self._owner
+        if hello.name:
+            self._owner = hello.name
+            self._hub.name(hello.name, self)
 
     def _get(self, message: GetTargets, now: float) -> Outgoing:
         hub = self._hub

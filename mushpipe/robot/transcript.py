@@ -15,7 +15,7 @@ import orjson
 
 from mushpipe.core import wire
 from mushpipe.core.errors import InputError
-from mushpipe.core.recorder import RecordingWriter
+from mushpipe.core.recorder import RecordingError, RecordingWriter
 from mushpipe.core.recording import RecordingReader
 from mushpipe.core.types import Header
 from mushpipe.robot.clock import Clock
@@ -82,7 +82,7 @@ class Transcript:
         try:
             while self._pass_on():
                 pass
-        except OSError as error:
+        except RecordingError as error:
             logger.error("the robot's transcript ends here: %s", error)
             self._drop_the_rest()
 

@@ -14,19 +14,21 @@ from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, PrivateAttr, field_validator, model_validator
 
-from mushpipe import GraphPath, Picks, RunInfo, Sink, SinkPath, Trace
+from mushpipe import GraphPath, Picks, RgbdFrame, RunInfo, Sink, SinkPath, Trace
 from mushpipe.core.errors import EXIT_INTERRUPTED, EXIT_NO_DEVICE, EXIT_OK, UsageError
 from mushpipe.robot.abb import AbbSession
-from mushpipe.robot.clock import Clock, Placer
+from mushpipe.robot.clock import Clock, Lateness, Placer
 from mushpipe.robot.connection import Kind, Limits
 from mushpipe.robot.hub import Ending, Hub, Settings
 from mushpipe.robot.server import Listener, Opener, Options, RobotServer
 from mushpipe.robot.session import JsonSession
 from mushpipe.robot.targets import Filter, Workspace
 from mushpipe.robot.transcript import Transcript
+from mushpipe.sources.realsense_frames import CLOCK_TOPIC, Domain
+from mushpipe.sources.realsense_frames import Clock as SensorClock
 
 logger = logging.getLogger("mushpipe")
-# Sensor stamps further from the host's clock than this are in a clock of their own.
+# Stamps further from the host's clock than this are in a clock of their own, if nobody says more.
 SAME_CLOCK_NS = 2 * 10**9
 
 
@@ -80,6 +82,7 @@ class RobotJsonSink(Sink):
 
     _clock: Clock = PrivateAttr(default_factory=Clock)
     _placer: Placer | None = PrivateAttr(None)
+    _lateness: Lateness = PrivateAttr(default_factory=Lateness)
     _filter: Filter | None = PrivateAttr(None)
     _server: RobotServer | None = PrivateAttr(None)
     _transcript: Transcript | None = PrivateAttr(None)
@@ -210,14 +213,20 @@ class RobotJsonSink(Sink):
             played -= (time.perf_counter_ns() - trace.left_ns) / 1e9
         if not self._live or self._placer is None:
             return played
-        same_clock = 0 <= header.arrival_ns - header.stamp_ns <= SAME_CLOCK_NS
-        placed = self._placer.place(header.stamp_ns if same_clock else header.arrival_ns)
+        sensor = trace.frame.attached.get(CLOCK_TOPIC)
+        sensor = sensor if isinstance(sensor, SensorClock) else None
+        shared = _is_of_host(trace.frame, sensor)
+        stamp_ns = min(header.stamp_ns, header.arrival_ns) if shared else header.arrival_ns
+        placed = self._placer.place(stamp_ns)
         if placed is None:
             if not self._warned:
                 self._warned = True
                 logger.warning("the camera's time stamps are not of this host: robots get nothing")
             return float("-inf")
-        return min(placed, played) - self.sensor_latency_ms / 1000
+        taken = min(placed, played)
+        if sensor is not None and not shared:
+            taken -= self._lateness.of(sensor.time_ms[0], header.stamp_ns, taken)
+        return taken - self.sensor_latency_ms / 1000
 
     def finish(self, summary: Mapping[str, Any]) -> None:
         """Note how the run ended, for the robots' last word."""
@@ -237,6 +246,13 @@ class RobotJsonSink(Sink):
         if self._transcript is not None:
             self._transcript.close()
             self._transcript = None
+
+
+def _is_of_host(frame: RgbdFrame, sensor: SensorClock | None) -> bool:
+    """Return whether a frame's stamp is on the clock on which it arrived."""
+    if sensor is not None:
+        return bool(sensor.domain[0] != Domain.HARDWARE)
+    return 0 <= frame.header.arrival_ns - frame.header.stamp_ns <= SAME_CLOCK_NS
 
 
 def _is_loopback(address: str) -> bool:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import operator
 from dataclasses import replace
+from functools import reduce
 from typing import Literal
 
 import numpy as np
@@ -64,7 +66,12 @@ class MakePicks(Stage):
     tilt_sigma_deg: float = Field(
         10, gt=0, description="from this sigma on the tilt counts as unobservable, degrees"
     )
-    memory_s: float = Field(1.0, ge=0, description="how long an id survives its mushroom unseen")
+    memory_s: float = Field(
+        1.0,
+        ge=0,
+        description="how long an id survives its mushroom unseen: longer than an arm hides it, and "
+        "than the time between two pictures where that is over a second",
+    )
 
     @field_validator("diameter_mm")
     @classmethod
@@ -100,7 +107,8 @@ class MakePicks(Stage):
         poses = poses or Poses.unknown(n)
         if not n == len(locations) == len(poses):
             raise ValueError(f"{n} circles, {len(locations)} locations, {len(poses)} poses")
-        _require_same(circles, locations, frame)
+        _require_same(circles, locations.position, "location", frame)
+        _require_same(circles, poses.apex, "pose", frame)
         self._total += n
         self._missing += int((locations.source == DepthSource.MISSING).sum())
         height, width = frame.color.shape[:2]
@@ -140,7 +148,10 @@ class MakePicks(Stage):
             (PickFlag.AT_BORDER, cut.any(axis=1)),
             (PickFlag.OCCLUDED, hidden > self.occluded_share),
             (PickFlag.TILT_UNOBSERVABLE, poses.sigma_rad >= np.radians(self.tilt_sigma_deg)),
-            (PickFlag.TOO_CLOSE_TO_NEIGHBOUR, 1000 * clearance(locations) < self.clearance_mm),
+            (
+                PickFlag.TOO_CLOSE_TO_NEIGHBOUR,
+                1000 * clearance(circles, locations) < self.clearance_mm,
+            ),
         ):
             flags[where] |= np.uint32(flag)
         return flags
@@ -149,7 +160,7 @@ class MakePicks(Stage):
         self, picks: Picks, up: NDArray[np.float64], hidden: NDArray[np.float64]
     ) -> NDArray[np.intp]:
         """Return the rows that are given, the first to pick first; without depth comes last."""
-        unwanted = sum(PickFlag[name.upper()] for name in self.withhold)
+        unwanted = reduce(operator.or_, (PickFlag[name.upper()] for name in self.withhold), 0)
         keep = (picks.score >= self.min_score) & ((picks.flags & np.uint32(unwanted)) == 0)
         if self.diameter_mm is not None:
             low, high = self.diameter_mm
@@ -182,18 +193,20 @@ class MakePicks(Stage):
             )
 
 
-def _require_same(circles: Circles, locations: Locations, frame: RgbdFrame) -> None:
-    """Raise ValueError where a location is not seen in its circle: rows were mixed up."""
+def _require_same(
+    circles: Circles, points: NDArray[np.float64], what: str, frame: RgbdFrame
+) -> None:
+    """Raise ValueError where a point (N, 3) is not seen in its circle: rows were mixed up."""
     if frame.camera is None:
         return
-    seen = frame.camera.project(locations.position)
+    seen = frame.camera.project(points)
     away = np.linalg.norm(seen - circles.center, axis=1) > 2 * circles.radius
     if away.any():
         row = int(np.flatnonzero(away)[0])
         (u, v), (x, y) = circles.center[row], seen[row]
         raise ValueError(
-            f"row {row}: the circle is at ({u:.0f}, {v:.0f}), its location at ({x:.0f}, {y:.0f}): "
-            "circles and locations must come from one chain; what sorts or filters circles "
+            f"row {row}: the circle is at ({u:.0f}, {v:.0f}), its {what} at ({x:.0f}, {y:.0f}): "
+            "circles, locations and poses must come from one chain; what sorts or filters circles "
             "belongs before the localizer"
         )
 

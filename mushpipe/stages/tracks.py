@@ -14,6 +14,7 @@ from mushpipe.core.tables import Circles, Columns, Floats, Locations, column
 
 GATE = 0.5  # farthest that a mushroom may be from where it is expected, in radii
 FEWEST = 3  # mushrooms that must agree on a shift
+PAUSE_NS = 10**9  # between two pictures; where it is longer, anything may have been moved meanwhile
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +47,7 @@ class Tracks:
 
     def __init__(self) -> None:
         self._next = 0
+        self._last_ns = 0
         self._known = Sightings.unknown(0)
 
     def update(
@@ -63,8 +65,10 @@ class Tracks:
             locations: The same mushrooms in 3D.
             image: Width and height, px.
             stamp_ns: When they were seen.
-            memory_ns: How long a mushroom that is not seen is remembered.
+            memory_ns: How long a mushroom that is not seen is remembered; one of the picture before
+                for `PAUSE_NS` at least.
         """
+        self._forget(stamp_ns, memory_ns)
         new = Sightings(
             id=np.full(len(circles), -1),
             seen_ns=np.full(len(circles), stamp_ns),
@@ -82,10 +86,16 @@ class Tracks:
         ids[fresh] = self._next + np.arange(len(fresh))
         self._next += len(fresh)
         unseen = np.setdiff1d(np.arange(len(old)), columns)
-        # where stamps go back, nobody knows for how long it was not seen
-        unseen = unseen[np.abs(stamp_ns - old.seen_ns[unseen]) <= memory_ns]
         self._known = _joined(replace(new, id=ids), old.take(unseen))
         return ids
+
+    def _forget(self, stamp_ns: int, memory_ns: int) -> None:
+        """Drop what was not seen for too long: what is found in its place may be another one."""
+        # where stamps go back, nobody knows for how long it was not seen
+        unseen_ns = np.abs(stamp_ns - self._known.seen_ns)
+        latest = (self._known.seen_ns == self._last_ns) & (unseen_ns <= PAUSE_NS)
+        self._known = self._known.take(np.flatnonzero(latest | (unseen_ns <= memory_ns)))
+        self._last_ns = stamp_ns
 
 
 def _flat(new: Sightings, old: Sightings) -> Floats:

@@ -118,6 +118,36 @@ def test_beginnings(settings: dict[str, object], hello: str, answer: str) -> Non
         assert (robot.ask("PING") == "PONG") == answer.startswith("HELLO")
 
 
+def test_a_target_can_be_kept_away_for_a_while() -> None:
+    with bench() as b, arm(b) as robot:
+        b.publish()
+        assert robot.ask("ACK,0,REJECTED,700") == "A,0,REMOVED"
+        assert robot.ask("NEXT").startswith("T,1,")
+        assert robot.ask("ACK,1,FAILED,3600001") == "E,BAD_REQUEST"
+        b.advance(0.7)
+        b.publish()
+        assert robot.ask("NEXT").startswith("T,0,")
+
+
+def test_two_robots_of_one_name_are_never_served_at_once() -> None:
+    with bench() as b, arm(b, "HELLO,1,NAME=irb") as one, arm(b, "HELLO,1,NAME=irb") as two:
+        b.publish()
+        assert two.ask("NEXT").startswith("T,0,")
+        assert one.reader.readline() == b""
+        assert two.ask("ACK,0,ACCEPTED") == "A,0,REMOVED"
+
+
+def test_a_target_that_may_be_gone_cannot_be_accepted_any_more() -> None:
+    with bench(max_age_s=0.5) as b, arm(b) as robot:
+        b.publish()
+        assert robot.ask("NEXT").startswith("T,0,")
+        assert robot.ask("ACK,1,ACCEPTED") == "A,1,REMOVED"
+        b.advance(0.6)
+        assert robot.ask("ACK,0,ACCEPTED").startswith("E,STALE,")
+        assert robot.ask("ACK,1,ACCEPTED") == "A,1,REMOVED"  # it has this one already
+        assert robot.ask("ACK,1,DONE") == "A,1,REMOVED"
+
+
 def test_it_shares_its_targets_with_json() -> None:
     with bench() as b, arm(b, "HELLO,1,NAME=irb") as robot, Peer(b.port) as peer:
         b.publish()

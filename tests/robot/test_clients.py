@@ -107,6 +107,18 @@ def test_a_half_closed_client_gets_its_answers() -> None:
         assert [m["op"] for m in peer.rest()] == ["targets", "pong"]
 
 
+def test_a_half_closed_client_that_said_too_much_at_once_gets_all_its_answers() -> None:
+    with bench(Limits(lines_per_s=10)) as b, Peer(b.port) as peer:
+        peer.greet()
+        for i in range(15):
+            peer.say("ping", id=i)
+        peer.sock.shutdown(socket.SHUT_WR)
+        for i in range(9):  # one was the hello
+            assert peer.read()["id"] == i
+        b.advance(1.0)
+        assert [m["id"] for m in peer.rest() if m["op"] == "pong"] == list(range(9, 15))
+
+
 def test_a_line_that_never_ends() -> None:
     with bench() as b, Peer(b.port) as loris, Peer(b.port) as healthy:
         loris.greet()

@@ -202,6 +202,7 @@ def test_two_robots_never_hold_one_target() -> None:
         # The connection is gone, the arm may not be: the target stays the robot's own.
         with Peer(b.port) as again:
             again.greet(name="left")
+            assert one.wait("bye")["reason"] == "replaced"
             assert again.targets() == ["m1", "m2"]
             assert again.ask("ack", id=1, target="m0", result="failed")["effect"] == "restored"
             assert again.targets() == ["m0", "m1", "m2"]

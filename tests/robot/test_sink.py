@@ -5,6 +5,7 @@ from __future__ import annotations
 import ssl
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,10 @@ from mushpipe.robot.hub import Hub, Settings
 from mushpipe.robot.messages import Refusal
 from mushpipe.sinks import robot_json
 from mushpipe.sinks.robot_json import RobotJsonSink
+from mushpipe.sources.realsense_frames import CLOCK_TOPIC, Domain
+from mushpipe.sources.realsense_frames import Clock as SensorClock
 from tests.robot.peer import Peer
-from tests.robot.scene import FakeClock, choice, make_picks
+from tests.robot.scene import EPOCH_NS, FakeClock, choice, make_picks
 
 LIVE = RunInfo("test", {}, live=True)
 
@@ -183,6 +186,27 @@ def test_an_age_counts_from_the_camera_on_the_monotonic_clock(sink: RobotJsonSin
     clock.offset_s -= 3600
     assert ages(sink, stamp, stamp) == pytest.approx(200, abs=1)
     assert ages(sink, clock.wall_ns() + 10**10) is None
+
+
+def sensor_at(stamp_ns: int, domain: Domain) -> dict[str, SensorClock]:
+    return {CLOCK_TOPIC: SensorClock(np.zeros(1), np.array([stamp_ns / 1e6]), np.array([domain]))}
+
+
+@pytest.mark.parametrize("domain", Domain)
+def test_a_picture_that_waited_in_the_camera_is_old(sink: RobotJsonSink, domain: Domain) -> None:
+    sink.open(LIVE)
+    clock = sink._clock
+    assert isinstance(clock, FakeClock)
+    for waited in (0.0, 0.1, 3.0):
+        stamp = clock.wall_ns()
+        clock.now += waited
+        frame = replace(
+            frame_at(stamp, clock.wall_ns()), attached=sensor_at(stamp - EPOCH_NS, domain)
+        )
+        sink.consume(make_picks(), Trace(frame, {}, {}, NOW_NS))
+        assert sink._server
+        age = sink._server.hub.age_ms(clock.now)
+        assert age == pytest.approx(1000 * waited, abs=2)
 
 
 def test_a_frame_whose_age_nobody_knows_is_stale(

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import socket
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mushpipe.robot.clock import MEMORY_S, TOLERANCE_S, Clock, Placer
+from mushpipe.robot.clock import MEMORY_S, TOLERANCE_S, Clock, Lateness, Placer
 from mushpipe.robot.connection import Connection, Limits
 from mushpipe.robot.hub import Ending, Hub, Settings
 from mushpipe.robot.ledger import FORGET_S, Ledger
@@ -179,8 +180,42 @@ def test_what_is_done_stays_away_while_it_is_seen_and_is_forgotten_later() -> No
 def test_a_target_can_be_kept_away_for_a_while() -> None:
     ledger = Ledger()
     assert ledger.apply("a", 1, "rejected", 5, visible=True, now=0) == "removed"
+    assert ledger.apply("a", 2, "failed", 2 * FORGET_S, visible=True, now=0) == "removed"
     ledger.settle(5)
+    assert ledger.hidden() == {2}
+    ledger.settle(2 * FORGET_S - 1)  # out of sight all the time
+    assert ledger.hidden() == {2}
+    ledger.settle(2 * FORGET_S)
     assert ledger.hidden() == set()
+
+
+def test_a_picked_mushroom_that_is_seen_and_withheld_is_not_forgotten() -> None:
+    clock = FakeClock()
+    hub, _ = hub_on(clock)
+    hub.ledger.apply("a", 1, "done", 0, visible=True, now=clock.now)
+    for _ in range(3):
+        clock.now += 0.7 * FORGET_S
+        hub.publish(choice(3, source=np.full(3, 2)), 1, 1, clock.now)  # a guess
+        hub.tick(clock.now)
+    assert hub.ledger.hidden() == {1}
+
+
+@given(
+    st.lists(st.tuples(st.floats(0, 100), st.floats(0, 3)), min_size=1, max_size=40),
+    st.floats(-1e-4, 1e-4),
+)
+def test_a_camera_whose_clock_drifts_is_late_by_its_queue_alone(
+    steps: list[tuple[float, float]], drift: float
+) -> None:
+    lateness, now, own = Lateness(), 0.0, 0.0
+    lateness.of(0.0, 10**18, 0.0)
+    for pause, queue in steps:
+        now, own = now + pause, own + pause * (1 + drift)
+        late = lateness.of(1e3 * own, 10**18 + round(1e9 * own), now + queue)
+        assert queue - 1e-6 <= late + 3.1e-4 * now
+        assert late <= queue + 1e-6
+    # Lost and found again: nothing is known of how its clock relates to ours.
+    assert lateness.of(0.0, 2 * 10**18, now + 500) == 0
 
 
 class Ageing(FakeClock):

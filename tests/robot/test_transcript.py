@@ -7,6 +7,7 @@ import socket
 import threading
 from pathlib import Path
 from queue import SimpleQueue
+from types import SimpleNamespace
 
 import pytest
 
@@ -164,8 +165,9 @@ def test_a_full_disk_ends_the_transcript_and_nothing_else(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    log = Transcript(tmp_path / "robot.mcap", FakeClock())
-    monkeypatch.setattr(log, "_write", full)
+    monkeypatch.setattr(module, "FLUSH_S", 0.01)
+    log = Transcript(tmp_path / "robot.mcap", Clock())
+    monkeypatch.setattr(log._writer._output, "_file", SimpleNamespace(write=full, close=bool))
     log.observe("rx", 1, b"lost")
     log._thread.join(PATIENCE_S)
     log.observe("rx", 1, b"lost as well")

@@ -103,6 +103,20 @@ def test_locations_of_other_circles_are_refused() -> None:
         MakePicks().process(frame_of(np.zeros((120, 160))), circles_at((50, 50), (80, 50)), found)
 
 
+def test_poses_of_other_circles_are_refused() -> None:
+    found = locations(DepthSource.MEASURED, DepthSource.MEASURED)
+    poses = Poses.unknown(
+        2,
+        apex=found.position[::-1],
+        axis=np.tile([0.0, 0.0, -1.0], (2, 1)),
+        valid=np.ones(2, bool),
+    )
+    with pytest.raises(ValueError, match=r"row 0: .* its pose at \(80, 50\)"):
+        MakePicks().process(
+            frame_of(np.zeros((120, 160))), circles_at((50, 50), (80, 50)), found, poses
+        )
+
+
 def test_rows_must_agree() -> None:
     with pytest.raises(ValueError, match="2 circles, 1 locations, 2 poses"):
         MakePicks().process(
@@ -185,6 +199,8 @@ def test_what_is_not_wanted_is_left_out() -> None:
     assert picked(BED, min_score=0.7).id.tolist() == [1, 0]
     assert picked(BED, diameter_mm=(35, 60)).id.tolist() == [1, 0]
     assert picked(BED, withhold=("occluded", "depth_missing")).id.tolist() == [1, 2]
+    twice = ("occluded", "occluded", "depth_missing")
+    assert picked(BED, withhold=twice).id.tolist() == [1, 2]
     with pytest.raises(ValidationError, match="smallest and the largest"):
         picked(BED, diameter_mm=(60, 35))
 
@@ -220,13 +236,22 @@ def test_the_hidden_share_is_that_of_the_circles() -> None:
 
 def test_room_for_the_gripper_is_the_gap_between_the_outlines() -> None:
     # 80 px at 0.5 m and f = 200 px are 200 mm between centres, 160 mm between outlines.
-    rows = [(40, 60, 0.5, 0.04), (120, 60, 0.5, 0.04), (80, 30, NAN, NAN)]
+    rows = [(40, 60, 0.5, 0.04), (120, 60, 0.5, 0.04)]
     for clearance, flagged in ((159, False), (161, True)):
         picks = picked(rows, clearance_mm=clearance)
         close = (picks.flags & PickFlag.TOO_CLOSE_TO_NEIGHBOUR) > 0
-        assert close.tolist() == [flagged, flagged, False]
+        assert close.tolist() == [flagged, flagged]
     alone = picked(rows[:1], clearance_mm=500)
     assert not alone.flags[0] & PickFlag.TOO_CLOSE_TO_NEIGHBOUR
+
+
+def test_a_neighbour_without_depth_takes_room_as_well() -> None:
+    # 40 px to the left at the cap's own depth: 100 mm between centres, 60 mm between outlines.
+    rows = [(80, 60, 0.5, 0.04), (40, 60, NAN, NAN)]
+    for clearance, flagged in ((59, False), (61, True)):
+        picks = picked(rows, clearance_mm=clearance)
+        close = (picks.flags & PickFlag.TOO_CLOSE_TO_NEIGHBOUR) > 0
+        assert close.tolist() == [flagged, False]
 
 
 def test_a_tilt_that_is_a_guess_is_flagged() -> None:

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mushpipe import Circles, DepthSource, Locations
-from mushpipe.stages.tracks import Tracks
+from mushpipe.stages.tracks import PAUSE_NS, Tracks
 from tests.stages.scenes import CAMERA
 
 IMAGE = (CAMERA.width, CAMERA.height)
@@ -86,6 +86,15 @@ def test_an_id_survives_a_gap_within_the_memory_and_is_never_used_again() -> Non
     assert ids(tracks, here, at=10) == [0]
     assert ids(tracks, at=21) == []
     assert ids(tracks, here, at=40) == [2]
+
+
+def test_what_is_found_after_a_pause_is_another_mushroom() -> None:
+    here = (50, 50, 0.5)
+    tracks = Tracks()
+    assert ids(tracks, here) == [0]
+    assert ids(tracks, here, at=PAUSE_NS) == [0]  # the next picture of a slow camera
+    assert ids(tracks, here, at=2 * PAUSE_NS + 1) == [1]
+    assert tracks.update(*seen(here), IMAGE, 9 * PAUSE_NS, 8 * PAUSE_NS).tolist() == [1]
 
 
 def test_an_id_does_not_outlive_stamps_that_go_back() -> None:
