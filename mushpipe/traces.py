@@ -87,6 +87,8 @@ def read_traces(path: Path) -> Iterator[Trace]:
     key, messages = next(groups, (None, []))
     for frame in McapSource.model_validate(images).frames():
         trace = Trace(frame, {}, {})
+        while key is not None and key[1] < frame.header.sequence:  # of a frame that was lost
+            key, messages = next(groups, (None, []))
         if (frame.header.stamp_ns, frame.header.sequence) == key:
             trace = _trace(frame, messages, order)
             key, messages = next(groups, (None, []))
@@ -136,7 +138,8 @@ def _trace(frame: RgbdFrame, messages: list[Raw], order: list[str]) -> Trace:
             decoded = decode_table(schema, raw.message.data)
             outputs[stage] = (*outputs.get(stage, ()), decoded.table if decoded else None)
         elif schema == "foxglove.RawImage" and (image := _image(raw)) is not None:
-            images.setdefault(stage, {})[part] = image
+            # what is not a stage's first output stands below its type
+            images.setdefault(stage, {})[part.rpartition("/")[2].removeprefix("mask")] = image
             if NO_DEPTH.items() <= raw.channel.metadata.items():
                 images[stage]["depth"] = (None, frame.depth_scale)
     last = frame

@@ -178,7 +178,7 @@ class SinkThread(threading.Thread):
 
     def run(self) -> None:
         """Consume until the box is closed and empty, or too many frames in a row failed."""
-        in_a_row = 0
+        in_a_row, last = 0, None
         consume = getattr(self.node.plugin, "consume")  # noqa: B009 - checked by ports_of
         while (item := self.box.get()) is not None:
             frame, inputs = item
@@ -191,12 +191,16 @@ class SinkThread(threading.Thread):
             except (Exception, SystemExit) as error:
                 self.failed += 1
                 in_a_row += 1
+                last = failure(self.node, frame.header.sequence, error)
                 if in_a_row >= self.tolerant:
-                    self.error = failure(self.node, frame.header.sequence, error)
+                    self.error = last
                     if not isinstance(error, MushpipeError):  # not a full disk, for instance
                         self.failed_frame = frame
                     self.box.close()
                     return
+                logger.warning("%s; the sink goes on with the next frame", last)
+        if not self.consumed:
+            self.error = last
 
     def report(self) -> SinkReport:
         """Return the sink's balance; frames left in its box by a failure count as dropped."""

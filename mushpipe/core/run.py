@@ -55,7 +55,9 @@ def run(
     try:
         runner.run()
     except MushpipeError as error:
-        runner.report.error = error
+        if runner.report.error is not None:  # the first is the one to report
+            logger.warning("%s", error)
+        runner.report.error = runner.report.error or error
     runner.report.elapsed_s = time.monotonic() - runner.started
     return runner.report
 
@@ -218,6 +220,7 @@ class _Runner:
         self.last_failed = failed
         self.failures_in_a_row += 1
         if self.failures_in_a_row >= self.tolerance:
+            self.over = True  # at once: the thread that waits must not deliver the next frame
             many = f" ({self.failures_in_a_row} frames in a row)" if self.tolerance > 1 else ""
             raise StageError(f"{failed}{many}", failed.exit_code) from error
         logger.warning("%s; the frame is skipped", failed)

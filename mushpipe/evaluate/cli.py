@@ -117,12 +117,17 @@ def evaluate(
 ) -> None:
     """Judge results against the truth, or run a graph and judge that."""
     from mushpipe.console import set_up_logging
+    from mushpipe.core.errors import UsageError
     from mushpipe.evaluate.command import Request
     from mushpipe.evaluate.judging import Rules
 
     set_up_logging(False)
     rules = Rules(iou, _up(gravity), resamples, seed)
     if plane is not None:
+        unfit = {"--truth": truth, "--recordings": recordings, "--set": set_, "--matrix": matrix}
+        unfit |= {"--frames": frames, "--topic": topic, "--out": out, "--report": report}
+        if given := [name for name, value in unfit.items() if value]:
+            raise UsageError(f"--plane does not go with {', '.join(given)}")
         raise typer.Exit(_planes(targets, plane, threshold or [], rules, output))
     limit = [] if frames is None else [f"source.max_frames={frames}"]
     overrides = [*limit, *(set_ or [])]

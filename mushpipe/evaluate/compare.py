@@ -49,11 +49,10 @@ def differences(
     values = []
     for events in (base, other):
         quantities = quantities_of(events)
-        weights = drawn[:, events.unit]
         values.append(
             {
                 name: statistics.evaluate(
-                    METRICS[name].statistic, quantities[METRICS[name].quantity], weights
+                    METRICS[name].statistic, quantities[METRICS[name].quantity], drawn, events.unit
                 )
                 for name in COMPARED
             }

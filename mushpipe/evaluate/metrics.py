@@ -166,20 +166,20 @@ def measure(events: Events, frames: int, resamples: int = 1000, seed: int = 0) -
         seed: Seed of the bootstrap.
     """
     rows, units = units_of(events, frames)
-    weights = statistics.draw(units, resamples, seed)[:, rows]
+    drawn = statistics.draw(units, resamples, seed)
     quantities = quantities_of(events)
     return {
-        metric.name: _value(metric, quantities[metric.quantity], weights)
+        metric.name: _value(metric, quantities[metric.quantity], drawn, rows)
         for metric in METRICS.values()
     }
 
 
-def _value(metric: Metric, x: Floats, weights: Floats) -> Value:
+def _value(metric: Metric, x: Floats, drawn: Floats, rows: NDArray[np.int64]) -> Value:
     n = int(np.isfinite(x).sum())
     value = statistics.evaluate(metric.statistic, x, np.ones((1, len(x))))[0]
-    if not len(weights) or not n:
+    if not len(drawn) or not n:
         return Value(float(value), np.nan, np.nan, n)
-    samples = statistics.evaluate(metric.statistic, x, weights)
+    samples = statistics.evaluate(metric.statistic, x, drawn, rows)
     return Value(float(value), *statistics.interval(samples), n)
 
 

@@ -95,7 +95,7 @@ class Results:
     def partial(self) -> bool:
         """Whether the run was asked to play only a part of its source."""
         source = self.manifest.get("graph", {}).get("source", {})
-        return any(source.get(key) for key in ("max_frames", "start", "end"))
+        return any(source.get(key) for key in ("max_frames", "max_seconds", "start", "end"))
 
     @property
     def robot_frames(self) -> set[str]:

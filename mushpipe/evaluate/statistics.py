@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mushpipe.core.tables import Floats
 
@@ -69,12 +70,22 @@ def dice(x: Floats, w: Floats) -> Floats:
         return np.asarray(2 * found / (found + rows))
 
 
-def evaluate(statistic: Statistic, x: Floats, w: Floats) -> Floats:
-    """Apply a statistic to the rows that are not NaN, in pieces that fit into memory."""
-    known = np.isfinite(x)
-    x, w = x[known], w[:, known]
-    step = max(1, _CHUNK // max(1, len(x)))
-    return np.concatenate([statistic(x, w[i : i + step]) for i in range(0, len(w), step)])
+def evaluate(
+    statistic: Statistic, x: Floats, w: Floats, units: NDArray[np.int64] | None = None
+) -> Floats:
+    """Apply a statistic to the rows that are not NaN, in pieces that fit into memory.
+
+    Args:
+        statistic: Of values (N,) and weights (K, N).
+        x: (N,) values.
+        w: (K, N) weights; with `units` (K, U), those of units.
+        units: (N,) the unit that each value belongs to.
+    """
+    known = np.flatnonzero(np.isfinite(x))
+    columns = known if units is None else units[known]
+    step = max(1, _CHUNK // max(1, len(known)))
+    pieces = (w[i : i + step][:, columns] for i in range(0, len(w), step))
+    return np.concatenate([statistic(x[known], piece) for piece in pieces])
 
 
 def draw(units: int, resamples: int, seed: int) -> Floats:

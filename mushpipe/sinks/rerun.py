@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 import signal
 import socket
 import subprocess
 import sys
 import time
 from collections import deque
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 from urllib.parse import urlsplit
@@ -18,6 +20,7 @@ from pydantic import Field, PrivateAttr, model_validator
 
 from mushpipe import Header, RunInfo, Sink, SinkPath, Trace
 from mushpipe.core.errors import DependencyError, UsageError
+from mushpipe.core.recorder import RecordingError
 from mushpipe.core.transform import Transform
 from mushpipe.sinks.rerun_memory import Remembering
 
@@ -25,6 +28,9 @@ logger = logging.getLogger("mushpipe")
 PORT = 9876  # the SDK's own default
 PATIENCE_S = 20.0
 LIVE_IMAGE_HZ = 5.0
+# On a full disk the SDK's writer dies, and whoever waits for it hangs (0.41), even at the end of
+# the program. So the sink ends before that.
+ROOM_BYTES = 64_000_000
 
 
 class RerunSink(Sink):
@@ -63,6 +69,7 @@ class RerunSink(Sink):
     cloud_step: int = Field(3, ge=1, description="pixels between the points of the cloud")
 
     _recording: Any = PrivateAttr(None)
+    _path: Path | None = PrivateAttr(None)
     _server: subprocess.Popen[bytes] | None = PrivateAttr(None)
     _notes: _Notes | None = PrivateAttr(None)
     _period_ns: int = PrivateAttr(0)
@@ -95,7 +102,9 @@ class RerunSink(Sink):
 
         sinks: list[Any] = []
         if self.save:
-            sinks.append(rr.FileSink(str(run.path(self.save)), write_footer=self.index))
+            self._path = run.path(self.save)
+            self._require_room()
+            sinks.append(rr.FileSink(str(self._path), write_footer=self.index))
         sinks += [rr.GrpcSink(url) for url in self._viewers()]
         self._recording = rr.RecordingStream("mushpipe", recording_id=run.recording)
         try:
@@ -133,14 +142,27 @@ class RerunSink(Sink):
             logger.info("look at it with: rerun %s", urls[-1])
         return urls
 
+    def _require_room(self) -> None:
+        folder = self._path and self._path.parent
+        if folder and folder.is_dir() and shutil.disk_usage(folder).free < ROOM_BYTES:
+            raise RecordingError(
+                f"{self._path}: there are less than {ROOM_BYTES // 10**6} MB left on its disk; "
+                "the file ends here and can be opened"
+            )
+
     def consume(self, trace: Trace) -> None:
-        """Log one frame."""
+        """Log one frame.
+
+        Raises:
+            RecordingError: The disk is full but for a last reserve.
+        """
         import rerun as rr
 
         from mushpipe.sinks import rerun_log
 
         if self._recording is None or self._memories is None:
             raise RuntimeError("the sink is not open")
+        self._require_room()
         rec, header, (images, results) = self._recording, trace.frame.header, self._memories
         rerun_log.set_frame(rec, header)
         self._last = header
@@ -186,7 +208,7 @@ class RerunSink(Sink):
                 set_frame(self._recording, self._last)  # timelines belong to a thread
             self._write_notes(rr)
             try:
-                self._recording.flush()
+                self._recording.flush(timeout_sec=PATIENCE_S)
             except RuntimeError as error:
                 logger.warning("the viewer did not take everything: %s", error)
             self._recording.disconnect()
@@ -266,7 +288,8 @@ def _start(host: str, port: int, *arguments: str) -> subprocess.Popen[bytes]:
     deadline = time.monotonic() + PATIENCE_S
     while not _answers(_reached_at(host), port):
         if server.poll() is not None or time.monotonic() > deadline:
-            os.killpg(server.pid, signal.SIGKILL)
+            with suppress(ProcessLookupError):  # it may have ended by itself
+                os.killpg(server.pid, signal.SIGKILL)
             raise DependencyError(f"Rerun does not start on {host}:{port}")
         time.sleep(0.05)
     return server

@@ -30,6 +30,7 @@ from mushpipe.sources.topics import Topics
 logger = logging.getLogger("mushpipe")
 _POLL_S = 0.1
 _BUFFER = 1 << 20
+_MOST_BEFORE = 100_000_000  # bytes without a colour image, some seconds: there will be none
 
 
 class StreamSource(RecordedSource):
@@ -108,11 +109,15 @@ class StreamSource(RecordedSource):
             self.camera_topic or wire.CAMERA_TOPIC,
         )
         reader = _Messages(self._records)
-        messages, head = iter(reader), list[Raw]()
+        messages, head, size = iter(reader), list[Raw](), 0
         for raw in messages:
             head.append(raw)
-            if raw.channel.topic == topics.depth or _count(head, topics.color) == 2:
+            size += len(raw.message.data)
+            colored = _count(head, topics.color)
+            if raw.channel.topic == topics.depth or colored == 2:
                 break
+            if not colored and size > _MOST_BEFORE:
+                raise InputError(self._nothing_on(topics.color, reader))
         if topics.depth not in {raw.channel.topic for raw in head}:
             topics = replace(topics, depth=None)
             if head:
@@ -128,8 +133,11 @@ class StreamSource(RecordedSource):
             damage = player.error or reader.damage
             raise InputError(f"the stream {damage}; {player.frames} frames came")
         if not player.frames:
-            found = ", ".join(sorted(reader.topics)) or "nothing"
-            raise InputError(f"the stream has no colour images on {topics.color}, only {found}")
+            raise InputError(self._nothing_on(topics.color, reader))
+
+    def _nothing_on(self, topic: str, reader: _Messages) -> str:
+        found = ", ".join(sorted(reader.topics)) or "nothing"
+        return f"the stream has no colour images on {topic}, only {found}"
 
 
 def _count(messages: list[Raw], topic: str) -> int:

@@ -1,11 +1,13 @@
 """Fast producers and slow or failing consumers: what is dropped, what waits, what ends a run."""
 
 import threading
+from collections.abc import Iterator
 from typing import ClassVar
 
 import pytest
 
-from mushpipe import Circles, RgbdFrame, Sink, Stage
+from mushpipe import Circles, InputError, RgbdFrame, Sink, Source, Stage
+from mushpipe.core.errors import EXIT_DAMAGED
 from tests.core.lab import Lab, held, make_frame, soon
 
 FULL = OSError("disk full")
@@ -133,10 +135,37 @@ def test_a_sink_that_wants_to_leave_does_not_hang_the_run(lab: Lab):
 SKIP = "\non_error: skip\nmax_failures: 3"
 
 
-def test_a_skipping_run_forgives_a_sink(lab: Lab):
+def test_a_skipping_run_forgives_a_sink(lab: Lab, caplog):
     report = lab.run(failing_sink(lab, 1, 2, 4) + SKIP, "source.count=6")
     assert vars(report.sinks["out"]) == {"handed": 6, "consumed": 3, "dropped": 0, "failed": 3}
     assert report.exit_code == 0
+    assert "failed on frame 4: OSError: disk full; the sink goes on" in caplog.text
+
+
+def test_a_sink_that_took_nothing_has_failed(lab: Lab):
+    report = lab.run(failing_sink(lab, 0, 1) + SKIP, "source.count=2")
+    assert report.balanced()
+    assert str(report.error) == "sink 'out' (picky) failed on frame 1: OSError: disk full"
+
+
+def test_the_first_error_is_reported_though_closing_fails_as_well(lab: Lab, caplog):
+    class Full(Sink):
+        def consume(self, frame: RgbdFrame, circles: Circles) -> None: ...
+
+        def close(self) -> None:
+            raise FULL
+
+    class Damaged(Source):
+        def frames(self) -> Iterator[RgbdFrame]:
+            yield make_frame(0)
+            raise InputError("the first")
+
+    lab.registry.sink("full", Full)
+    lab.registry.source("damaged", Damaged)
+    report = lab.run(lab.chain("fussy", source="damaged").replace("collect", "full"))
+    assert "the first" in str(report.error)
+    assert report.exit_code == EXIT_DAMAGED
+    assert "disk full" in caplog.text
 
 
 def test_too_many_failures_of_a_sink_in_a_row_end_a_skipping_run(lab: Lab):

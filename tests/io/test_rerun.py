@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -12,7 +13,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mushpipe import Circles, Mask, Picks, RunInfo
-from mushpipe.sinks.rerun import RerunSink
+from mushpipe.core.recorder import RecordingError
+from mushpipe.sinks import rerun as module
+from mushpipe.sinks.rerun import ROOM_BYTES, RerunSink
 from tests.io.bags import FX, FY, OPTICAL, PERIOD, T0, depth_pixels
 from tests.io.rerun_file import IMAGE, read, show, unpack, values
 from tests.io.values import SIZE, make_circles, make_frame, make_picks, no_picks, trace_of
@@ -23,6 +26,21 @@ def test_frames_stand_on_two_timelines(tmp_path: Path) -> None:
     color = found[f"{IMAGE}/color"]
     assert color["frame"] == [10, 11, 12]
     assert color["capture"] == [T0 + i * PERIOD for i in range(3)]
+
+
+def test_a_disk_that_is_all_but_full_ends_the_file_and_hangs_nobody(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free = iter([ROOM_BYTES, ROOM_BYTES, ROOM_BYTES - 1])
+    left = lambda _: SimpleNamespace(free=next(free))  # noqa: E731
+    monkeypatch.setattr(module.shutil, "disk_usage", left)
+    sink = RerunSink.model_validate({"save": tmp_path / "run.rrd"})
+    sink.open(RunInfo("test", {}))
+    sink.consume(trace_of(make_frame(0)))
+    with pytest.raises(RecordingError, match=r"run\.rrd: there are less than 64 MB left"):
+        sink.consume(trace_of(make_frame(1)))
+    sink.close()
+    assert read(tmp_path / "run.rrd")[f"{IMAGE}/color"]["frame"] == [10]
 
 
 def test_color_is_stored_as_jpeg_of_the_stated_quality(tmp_path: Path) -> None:

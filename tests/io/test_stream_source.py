@@ -23,6 +23,7 @@ from mushpipe.core.errors import (
 )
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.recording import MANIFEST
+from mushpipe.sources import stream as module
 from mushpipe.sources.stream import StreamSource
 from tests.cli.test_record import CAMERA, picture
 from tests.core.lab import Lab, held, soon
@@ -152,6 +153,20 @@ def test_a_stream_without_images_names_what_it_holds(tmp_path: Path) -> None:
     source = opened(stream(tmp_path / "s.mcap", 2), color_topic="/left")
     with pytest.raises(InputError, match=r"no colour images on /left, only /camera/"):
         list(source.frames())
+
+
+def test_a_sender_without_images_is_not_listened_to_for_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_MOST_BEFORE", 1000)
+    data = stream(tmp_path / "s.mcap", 3).read_bytes()
+    source = StreamSource(color_topic="/left")
+    source._number, end = os.pipe()  # which stays open: the sender goes on
+    threading.Thread(target=os.write, args=(end, data), daemon=True).start()
+    source.open()
+    with pytest.raises(InputError, match="no colour images on /left"):
+        list(source.frames())
+    os.close(source._number)
 
 
 def test_a_terminal_is_no_stream() -> None:

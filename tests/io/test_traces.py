@@ -13,6 +13,7 @@ from mushpipe import Circles, Locations, Mask, Picks, RunInfo, Trace
 from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.manifest import _describe
 from mushpipe.sinks.mcap import McapSink
+from mushpipe.sources.mcap import McapSource
 from mushpipe.traces import read_trace, read_traces
 from tests.io.values import make_circles, make_frame, make_picks, no_picks, record, trace_of
 
@@ -89,6 +90,31 @@ def test_a_frame_that_no_stage_answered_stands_alone(tmp_path: Path) -> None:
     assert read_trace(path, 12).frame.header.sequence == 12
     with pytest.raises(UsageError, match="no frame 3; it holds 10 to 12"):
         read_trace(path, 3)
+
+
+def test_a_lost_image_costs_the_results_of_its_own_frame_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = record(tmp_path / "out.mcap", [full_trace(i) for i in range(4)])
+    whole = McapSource.frames
+    monkeypatch.setattr(
+        McapSource, "frames", lambda self: (f for f in whole(self) if f.header.sequence != 11)
+    )
+    found = list(read_traces(path))
+    assert [t.frame.header.sequence for t in found] == [10, 12, 13]
+    assert all(trace.outputs for trace in found)
+
+
+def test_a_mask_comes_back_that_is_not_the_first_thing_a_stage_puts_out(tmp_path: Path) -> None:
+    mask = np.zeros((24, 32), bool)
+    mask[3:9, 4:7] = True
+    path = record(
+        tmp_path / "out.mcap",
+        [trace_of(make_frame(), both=(make_circles(), Mask(mask, ~mask)))],
+    )
+    (trace,) = read_traces(path)
+    (found,) = (value for value in trace.outputs["both"] if isinstance(value, Mask))
+    same(found, Mask(mask, ~mask))
 
 
 def test_frames_whose_stamp_stands_still_stay_apart(tmp_path: Path) -> None:
