@@ -117,23 +117,30 @@ def evaluate(
 ) -> None:
     """Judge results against the truth, or run a graph and judge that."""
     from mushpipe.console import set_up_logging
-    from mushpipe.core.errors import UsageError
     from mushpipe.evaluate.command import Request
     from mushpipe.evaluate.judging import Rules
 
     set_up_logging(False)
     rules = Rules(iou, _up(gravity), resamples, seed)
     if plane is not None:
-        unfit = {"--truth": truth, "--recordings": recordings, "--set": set_, "--matrix": matrix}
-        unfit |= {"--frames": frames, "--topic": topic, "--out": out, "--report": report}
-        if given := [name for name, value in unfit.items() if value]:
-            raise UsageError(f"--plane does not go with {', '.join(given)}")
+        _require_none(
+            truth=truth, recordings=recordings, set=set_, matrix=matrix,
+            frames=frames, topic=topic, out=out, report=report,
+        )  # fmt: skip
         raise typer.Exit(_planes(targets, plane, threshold or [], rules, output))
     limit = [] if frames is None else [f"source.max_frames={frames}"]
     overrides = [*limit, *(set_ or [])]
     request = Request(targets, truth or [], recordings or [], overrides, matrix or [])
     request.thresholds, request.topic, request.rules = threshold or [], topic, rules
     raise typer.Exit(_judge(request, out, report, output))
+
+
+def _require_none(**options: object) -> None:
+    """Raise UsageError where options were given that `--plane` does not look at."""
+    from mushpipe.core.errors import UsageError
+
+    if given := [f"--{name}" for name, value in options.items() if value]:
+        raise UsageError(f"--plane does not go with {', '.join(given)}")
 
 
 def _judge(request: Request, out: Path | None, report: Path | None, output: Output) -> int:

@@ -72,4 +72,4 @@ def _gaps(place: Floats, radius: Floats) -> Floats:
     """Return the gaps (N, N) between circles; there is none to itself."""
     gaps = cdist(place, place) - radius[:, None] - radius[None]
     np.fill_diagonal(gaps, np.inf)
-    return gaps
+    return np.asarray(gaps)
