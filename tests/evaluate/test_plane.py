@@ -149,6 +149,13 @@ def test_distances_that_are_not_those_of_the_planes_are_refused(tmp_path: Path) 
             judge_planes(files, text, [], 0, 0)
 
 
+def test_options_that_planes_do_not_look_at_are_refused(tmp_path: Path) -> None:
+    options = ["--frames", "20", "--report", str(tmp_path / "page")]
+    result = CliRunner().invoke(app, ["eval", "--plane", "0.51", str(tmp_path), *options])
+    assert "--plane does not go with --frames, --report" in str(result.exception)
+    assert not (tmp_path / "page").exists()
+
+
 def test_a_heap_is_no_plane(tmp_path: Path) -> None:
     row = measure_plane(plane(tmp_path, 0.51, 0.003, 0.02), 0.51, resamples=0)
     with pytest.raises(InputError, match="is no plane, depth departs from one by 2"):

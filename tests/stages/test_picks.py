@@ -57,17 +57,18 @@ def test_flags_say_what_is_not_measured() -> None:
 
 def test_the_apex_stands_in_for_the_surface_only_where_the_pose_is_valid() -> None:
     circles = circles_at((50, 50), (80, 50))
+    apex = CAMERA.deproject(np.array([[52.0, 50.0]]), np.array([0.48]))[0].tolist()
     poses = Poses(
         quaternion=[[1, 0, 0, 0], [NAN] * 4],
         axis=[[0, 0, -1], [NAN] * 3],
-        apex=[[0.0, 0.0, 0.48], [NAN] * 3],
+        apex=[apex, [NAN] * 3],
         sigma_rad=[0.1, NAN],
         fitness=[1.0, NAN],
         valid=[True, False],
     )
     found = locations(DepthSource.MEASURED, DepthSource.MEASURED)
     picks = MakePicks().process(frame_of(np.zeros((120, 160))), circles, found, poses)
-    assert picks.position.tolist() == [[0.0, 0.0, 0.48], found.position[1].tolist()]
+    assert picks.position.tolist() == [apex, found.position[1].tolist()]
     assert [bool(f & PickFlag.POSE_UNKNOWN) for f in picks.flags] == [False, True]
 
 
@@ -85,7 +86,7 @@ def test_the_sigma_of_a_position_is_that_of_the_apex_where_there_is_one() -> Non
     poses = Poses(
         quaternion=[[*Rotation.align_vectors([axis], [[0, 0, 1]])[0].as_quat()], [NAN] * 4],
         axis=[axis, [NAN] * 3],
-        apex=[[0.0, 0.0, 0.48], [NAN] * 3],
+        apex=[CAMERA.deproject(np.array([[52.0, 50.0]]), np.array([0.48]))[0], [NAN] * 3],
         sigma_rad=[np.radians(sigma_deg), NAN],
         fitness=[1.0, NAN],
         valid=[True, False],
@@ -105,10 +106,12 @@ def test_locations_of_other_circles_are_refused() -> None:
 
 def test_poses_of_other_circles_are_refused() -> None:
     found = locations(DepthSource.MEASURED, DepthSource.MEASURED)
-    poses = Poses.unknown(
-        2,
-        apex=found.position[::-1],
+    poses = Poses(
+        quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)),
         axis=np.tile([0.0, 0.0, -1.0], (2, 1)),
+        apex=found.position[::-1],
+        sigma_rad=np.zeros(2),
+        fitness=np.ones(2),
         valid=np.ones(2, bool),
     )
     with pytest.raises(ValueError, match=r"row 0: .* its pose at \(80, 50\)"):
@@ -246,9 +249,9 @@ def test_room_for_the_gripper_is_the_gap_between_the_outlines() -> None:
 
 
 def test_a_neighbour_without_depth_takes_room_as_well() -> None:
-    # 40 px to the left at the cap's own depth: 100 mm between centres, 60 mm between outlines.
+    # 40 px to the left, 16 px between outlines; the cap's 20 mm of radius are 12 px: 26.7 mm.
     rows = [(80, 60, 0.5, 0.04), (40, 60, NAN, NAN)]
-    for clearance, flagged in ((59, False), (61, True)):
+    for clearance, flagged in ((26, False), (27, True)):
         picks = picked(rows, clearance_mm=clearance)
         close = (picks.flags & PickFlag.TOO_CLOSE_TO_NEIGHBOUR) > 0
         assert close.tolist() == [flagged, False]
