@@ -1,10 +1,9 @@
 """The network: after CenterNet (Zhou, Wang & Kraehenbuehl 2019, arXiv 1904.07850), but tiny.
 
 Strides 2 to 32: full convolutions down to stride 4, depthwise-separable residual blocks below, an
-additive top-down path (Lin et al. 2017, arXiv 1612.03144), one head at stride 4. Where the image is
-large the network is thin: half of the time would go into strides 2 and 4. Widths are whole multiples
-of 8, most of 16, since ONNX Runtime computes as many channels at a time, and what follows a sum is
-one operation with it.
+additive top-down path (Lin et al. 2017, arXiv 1612.03144), one head at stride 4. Widths are whole
+multiples of 16, since ONNX Runtime computes as many channels at a time, and what follows a sum is
+one operation with it; both make the network a fifth faster.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from mushpipe.stages.cap_decode import CHANNELS, HEAT, MASK, OFFSET, RADIUS
 
 WIDTHS = (32, 64, 96, 128)  # channels at strides 4, 8, 16, 32
 BLOCKS = (2, 3, 3)  # residual blocks at strides 8, 16, 32
-NECK = WIDTHS[0]
+NECK = 32
 
 
 def normed(inputs: int, outputs: int, size: int, stride: int = 1, groups: int = 1) -> nn.Sequential:
@@ -57,13 +56,14 @@ class CapNet(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         first = WIDTHS[0]
-        self.stem = nn.Sequential(convolution(3, 8, 3, 2), convolution(8, first, 3, 2))
+        self.stem = nn.Sequential(
+            convolution(3, 16, 3, 2), convolution(16, first, 3, 2), Residual(first)
+        )
         self.down = nn.ModuleList(
             nn.Sequential(*separable(a, b, 2), nn.ReLU(), *(Residual(b) for _ in range(blocks)))
             for (a, b), blocks in zip(pairwise(WIDTHS), BLOCKS, strict=True)
         )
-        laterals = (nn.Conv2d(width, NECK, 1) for width in WIDTHS[1:])
-        self.lateral = nn.ModuleList([nn.Identity(), *laterals])  # the finest has NECK channels
+        self.lateral = nn.ModuleList(nn.Conv2d(width, NECK, 1) for width in WIDTHS)
         self.merge = nn.ModuleList(Residual(NECK) for _ in WIDTHS)
         last = nn.Conv2d(NECK, CHANNELS, 1)
         bias = torch.zeros(CHANNELS)
