@@ -28,8 +28,7 @@ DARK = 4.0  # gray levels that are added, since the darkest ones are noise
 MOST = 6.0
 # Differences between caps of a kind: of the log of brightness, of red and blue over green.
 USUAL = np.array([0.2, 0.08, 0.08])
-KIN = 3  # so many sure caps like it, and this share of them, are its kind
-SHARE = 0.1
+KIN, PART = 3, 10  # so many sure caps like it, and one in so many of them, are its kind
 
 
 def unlike(color: NDArray[np.uint8], circles: Circles) -> Floats:
@@ -50,7 +49,7 @@ def unlike(color: NDArray[np.uint8], circles: Circles) -> Floats:
     # read-only as a frame's: to the compiler another type, and another kernel
     _tones(locked(color, np.uint8), discs_of(circles), tones)
     tones /= USUAL * np.sqrt(len(USUAL))
-    nearest = max(KIN, math.ceil(SHARE * len(sure)))
+    nearest = max(KIN, -(-len(sure) // PART))
     return np.minimum(_distances(tones, sure, nearest), MOST)
 
 
