@@ -10,9 +10,8 @@ from math import inf
 MEMORY_S = 10.0
 TOLERANCE_S = 0.02
 STEP_S = 0.002
-DRIFT = (
-    2e-4  # most that two clocks drift apart; quartzes of cameras and hosts do by a quarter of it
-)
+# Most that two clocks drift apart, s/s: quartzes of cameras and hosts do by a quarter of it.
+DRIFT = 2e-4
 # Time spent in suspend must age a target, too; CLOCK_MONOTONIC stands still meanwhile.
 _MONOTONIC = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
 

@@ -94,6 +94,7 @@ class RerunSink(Sink):
 
         Raises:
             UsageError: Nobody listens at `connect`, or the file cannot be written.
+            RecordingError: The disk is full but for a last reserve.
             DependencyError: There is no display for `spawn`, or the server does not start.
         """
         import rerun as rr
