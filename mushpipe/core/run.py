@@ -163,7 +163,11 @@ class _Runner:
                 frame, left_ns, ticket = taken
                 passage = self.chain.passed(frame, ticket)
                 with self.exit.turn(ticket):
-                    self._deliver(passage, left_ns, reader, threads)
+                    try:
+                        self._deliver(passage, left_ns, reader, threads)
+                    except BaseException:  # before the turn ends: the next frame must not follow
+                        self.over = True
+                        raise
         except BaseException as error:  # an interrupt, say: nobody may wait for this thread
             self.failure = self.failure or error
             self.over = True
@@ -220,7 +224,6 @@ class _Runner:
         self.last_failed = failed
         self.failures_in_a_row += 1
         if self.failures_in_a_row >= self.tolerance:
-            self.over = True  # at once: the thread that waits must not deliver the next frame
             many = f" ({self.failures_in_a_row} frames in a row)" if self.tolerance > 1 else ""
             raise StageError(f"{failed}{many}", failed.exit_code) from error
         logger.warning("%s; the frame is skipped", failed)
