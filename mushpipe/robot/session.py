@@ -5,7 +5,7 @@ from __future__ import annotations
 import hmac
 from typing import Protocol
 
-from mushpipe.robot.hub import Ending, Hub
+from mushpipe.robot.hub import Ending, Hub, Leaving
 from mushpipe.robot.messages import (
     HEARTBEAT_S,
     VERSION,
@@ -31,11 +31,10 @@ class Outgoing:
         self.expires = expires
 
 
-class Session(Protocol):
+class Session(Leaving, Protocol):
     """What a connection needs of either protocol. Times are monotonic seconds."""
 
     ready: bool
-    closing: bool
     terminators: bytes
 
     def handle(self, line: bytes, now: float) -> Outgoing | None:
@@ -46,9 +45,6 @@ class Session(Protocol):
 
     def refuse(self, refusal: Refusal, now: float) -> Outgoing:
         """Say why the connection ends, and end it."""
-
-    def leave(self, reason: Ending) -> None:
-        """End the connection after a last word."""
 
 
 class JsonSession:
