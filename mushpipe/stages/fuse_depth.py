@@ -13,6 +13,7 @@ from mushpipe import RgbdFrame, Stage
 from mushpipe.core.jit import jit
 
 Singles = NDArray[np.float32]
+PAUSE_NS = 1_000_000_000  # what was seen longer ago is no part of what is seen now
 
 
 class FuseDepth(Stage):
@@ -20,7 +21,8 @@ class FuseDepth(Stage):
 
     A pixel whose depth leaves its mean by more than the gate starts anew: it sees another surface
     now. A pixel without depth keeps its mean until it has been without for `frames` frames.
-    Between shots of a moving camera nothing agrees, and frames pass as they are.
+    Where more pixels start anew than noise explains, the camera moved, and the frame passes as it
+    is; so it does after a pause, and where stamps go back.
     """
 
     frames: int = Field(5, ge=1, le=100, description="frames that are averaged")
@@ -28,13 +30,17 @@ class FuseDepth(Stage):
         4.0, gt=0, le=100, description="step of depth at which a pixel starts anew"
     )
     moved: float = Field(
-        0.3, gt=0, le=1, description="share of pixels starting anew at which all of them do"
+        0.05,
+        gt=0,
+        le=1,
+        description="share, of the pixels with depth before and now, starting anew at which all do",
     )
 
     _mean: Singles | None = PrivateAttr(None)
     _count: NDArray[np.uint8] | None = PrivateAttr(None)
     _age: NDArray[np.uint8] | None = PrivateAttr(None)
     _scale: float = PrivateAttr(0.0)
+    _stamp_ns: int = PrivateAttr(0)
 
     def open(self) -> None:
         """Compile the kernel and forget what was seen."""
@@ -57,11 +63,13 @@ class FuseDepth(Stage):
             self._mean is None
             or self._mean.shape != depth.shape
             or self._scale != frame.depth_scale
+            or not 0 <= frame.header.stamp_ns - self._stamp_ns <= PAUSE_NS
         ):
             self._forget(frame)
+        self._stamp_ns = frame.header.stamp_ns
         gate = self.gate_mm / 1000 / frame.depth_scale
-        fresh = fuse(depth, self._mean, self._count, self._age, gate, self.frames)
-        if fresh > self.moved * depth.size:
+        fresh, known = fuse(depth, self._mean, self._count, self._age, gate, self.frames)
+        if fresh > self.moved * known:
             self._forget(frame)
             fuse(depth, self._mean, self._count, self._age, gate, self.frames)
         return replace(frame, depth=np.array(self._mean))
@@ -73,7 +81,7 @@ class FuseDepth(Stage):
 
 
 @jit
-def fuse(depth: NDArray[Any], mean: Any, count: Any, age: Any, gate: float, frames: int) -> int:
+def fuse(depth: NDArray[Any], mean: Any, count: Any, age: Any, gate: float, frames: int) -> Any:
     """Take one more depth image into a mean.
 
     Args:
@@ -85,9 +93,9 @@ def fuse(depth: NDArray[Any], mean: Any, count: Any, age: Any, gate: float, fram
         frames: Most frames that a mean holds.
 
     Returns:
-        How many pixels started anew.
+        How many pixels started anew, and how many had depth before and have it now.
     """
-    fresh = 0
+    fresh, known = 0, 0
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
             z = np.float32(depth[v, u])
@@ -99,10 +107,11 @@ def fuse(depth: NDArray[Any], mean: Any, count: Any, age: Any, gate: float, fram
                 continue
             age[v, u] = 0
             step = z - mean[v, u]
+            known += mean[v, u] > 0
             if mean[v, u] > 0 and abs(step) <= gate:
                 count[v, u] = min(count[v, u] + 1, frames)
                 mean[v, u] += step / np.float32(count[v, u])
             else:
                 fresh += mean[v, u] > 0
                 mean[v, u], count[v, u] = z, 1
-    return fresh
+    return fresh, known

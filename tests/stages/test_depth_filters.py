@@ -1,13 +1,19 @@
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from mushpipe import Header, RgbdFrame
+from mushpipe.sources.mcap import McapSource
 from mushpipe.stages.depth_correct import DepthCorrect
 from mushpipe.stages.fuse_depth import FuseDepth
 
 SHAPE = (40, 50)
+RECORDINGS = Path(__file__).parents[2] / "recordings"
 
 
 def frame(depth: np.ndarray | None, scale: float = 0.001) -> RgbdFrame:
@@ -50,6 +56,23 @@ def test_a_scene_that_moved_starts_anew() -> None:
     stage.process(frame(ramp))
     out = stage.process(frame(ramp[:, ::-1].copy()))
     assert (out.depth == ramp[:, ::-1]).all()
+
+
+def test_frames_of_a_moving_camera_pass_as_they_are() -> None:
+    stage = FuseDepth()
+    source = McapSource(path=RECORDINGS / "moving.mcap")
+    for each in source.frames():
+        assert_array_equal(stage.process(each).depth, each.depth)
+
+
+@pytest.mark.parametrize("later", [-1, 1_000_000_001])
+def test_nothing_is_filled_from_before_a_pause_or_after_stamps_went_back(later: int) -> None:
+    stage = FuseDepth()
+    whole, hole = np.full(SHAPE, 500, np.uint16), np.full(SHAPE, 500, np.uint16)
+    hole[3, 4] = 0
+    stage.process(frame(whole))
+    again = replace(frame(hole), header=Header(1 + later, 1, "optical"))
+    assert stage.process(again).depth[3, 4] == 0
 
 
 def test_nan_is_missing_and_no_depth_passes() -> None:
