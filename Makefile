@@ -81,8 +81,8 @@ train-seeds: train
 
 $(NET)/seed-%.onnx:
 	$(BIN)/python -m training.net.train --seed $* --out $(NET)/seed-$*.pt
-	$(BIN)/python -m training.net.train --seed 2$* --start $(NET)/seed-$*.pt --steps 6000 \
-	  --rate 0.5 --stained --out $(NET)/stained-$*.pt
+	$(BIN)/python -m training.net.train --seed 2$* --start $(NET)/seed-$*.pt --steps 8000 \
+	  --rate 1.2e-3 --stained --out $(NET)/stained-$*.pt
 	$(BIN)/python -m training.net.export --weights $(NET)/seed-$*.pt $(NET)/stained-$*.pt --out $@
 
 # A long replay with every sink attached, whose memory must stay flat; MINUTES=5 for a short one.

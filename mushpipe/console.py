@@ -18,9 +18,9 @@ from rich.logging import RichHandler
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from mushpipe.core.edges import files_of
+from mushpipe.core.edges import files_read
 from mushpipe.core.errors import EXIT_INTERRUPTED
-from mushpipe.core.overwriting import spare
+from mushpipe.core.overwriting import require_writable, spare
 from mushpipe.core.plan import Plan
 from mushpipe.core.report import RunReport
 from mushpipe.core.run import run
@@ -88,13 +88,16 @@ def execute(
     plan: Plan, manifest: Path | None, capsules: Path | None, size: Callable[[], int] | None = None
 ) -> RunReport:
     """Run a plan in front of a user; no ``manifest`` or ``capsules`` where None, ``size`` above."""
-    spare(manifest, *files_of(plan.source))
+    spare(manifest, *files_read(plan))
+    if manifest is not None and manifest.parent.exists():
+        require_writable(manifest)
     stop = threading.Event()
     with interruptible(stop), progress_bar(size) as show:
         report = run(plan, stop, show, capsules)
     show_report(report)
     try:
         if manifest is not None and report.exit_code != 2:  # a wrong command line is no run
+            spare(manifest, *report.files)
             manifest.parent.mkdir(parents=True, exist_ok=True)
             content = {**report.manifest, "result": report.summary()}
             manifest.write_text(json.dumps(content, indent=2) + "\n")

@@ -63,7 +63,8 @@ def view(
     file: Annotated[Path, typer.Argument(help="recording, or results written by a sink mcap")],
     save: Annotated[Path | None, typer.Option(help="write an .rrd file, open no window")] = None,
     serve: Annotated[
-        int | None, typer.Option(metavar="PORT", help="let viewers fetch it, until Ctrl-C")
+        int | None,
+        typer.Option(metavar="PORT", min=1, max=65535, help="let viewers fetch it, until Ctrl-C"),
     ] = None,
 ) -> None:
     """Open a recording or results in the Rerun viewer."""

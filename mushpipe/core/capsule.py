@@ -20,8 +20,8 @@ def write_capsule(folder: Path, plan: Plan, node: Node, frame: RgbdFrame, messag
     """Write the frame on which a node failed, with the graph up to it, and return the path.
 
     Its name says of which recording it is the frame, or with which stamp a camera took it.
-    The graph keeps its stages, and of its sinks only a failing one: running a capsule must not
-    reach a robot or write over results.
+    The graph keeps its stages, and of its sinks only a failing one, whose files go beside the
+    capsule: running it must not reach a robot or write over results.
     """
     folder.mkdir(parents=True, exist_ok=True)
     source = plan.source.plugin
@@ -30,6 +30,7 @@ def write_capsule(folder: Path, plan: Plan, node: Node, frame: RgbdFrame, messag
     path = folder / f"failure-{name}-{node.name}-{number}.mcap"
     sinks = tuple(sink for sink in plan.sinks if sink.name == node.name)
     kept = replace(plan, sinks=sinks, on_error="fail")  # one frame: skipping it would show nothing
+    kept = kept.into(path.with_suffix(".out"))
     metadata = {GRAPH: {"json": json.dumps(kept.resolved()), "failure": message}}
     writer = RecordingWriter(path, metadata)
     writer.frame(frame)

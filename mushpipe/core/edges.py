@@ -14,7 +14,7 @@ from typing import Any
 
 from mushpipe.core.errors import MushpipeError, PluginError, StageError
 from mushpipe.core.mailbox import Mailbox
-from mushpipe.core.plan import Node
+from mushpipe.core.plan import Node, Plan
 from mushpipe.core.report import Durations, SinkReport
 from mushpipe.core.stage import ReplaySource, RunInfo, Sink, Source
 from mushpipe.core.types import RgbdFrame
@@ -44,6 +44,20 @@ def named(node: Node) -> Iterator[None]:
         raise
     except Exception as error:
         raise failure(node, None, error) from error
+
+
+def files_read(plan: Plan) -> tuple[Path, ...]:
+    """Return what a run reads: its graph, what its source plays, models, and plugins in files.
+
+    Raises:
+        StageError: The source's ``files`` failed.
+        PluginError: It gave no paths.
+    """
+    nodes = (plan.source, *plan.stages, *plan.sinks)
+    code = (node.use.rpartition(":")[0] for node in nodes if ".py:" in node.use)
+    given = (path for node in nodes for path in node.plugin.given_files())
+    graph = Path(plan.file)
+    return (graph, *(graph.parent / file for file in code), *given, *files_of(plan.source))
 
 
 def files_of(node: Node, run: RunInfo | None = None) -> tuple[Path, ...]:

@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -48,8 +49,9 @@ def brown(xy: Array, coefficients: tuple[float, ...]) -> Array:
 def brown_inverse(xy: Array, coefficients: tuple[float, ...], iterations: int = 60) -> Array:
     """Undo `brown` by Gauss-Newton with a numeric Jacobian.
 
-    Points where no pre-image is found to 1e-7 become NaN: a lens model is only valid inside
-    the image it was fitted on, and a wrong ray must not pass for a right one.
+    Points where no pre-image is found to 1e-7 become NaN, and so do pre-images beyond the fold of
+    the polynomial: a lens model is only valid inside the image it was fitted on, and a wrong ray
+    must not pass for a right one.
     """
     guess = xy.copy()
     step = 1e-6
@@ -67,8 +69,21 @@ def brown_inverse(xy: Array, coefficients: tuple[float, ...], iterations: int = 
             update = np.stack([d * ex - b * ey, a * ey - c * ex], axis=-1)
             guess = guess - update / (a * d - b * c)[..., None]
         bad = ~(np.abs(brown(guess, coefficients) - xy).max(axis=-1) < 1e-7)
+        bad |= (guess**2).sum(axis=-1) >= _fold(coefficients)
     guess[bad] = np.nan
     return guess
+
+
+def _fold(coefficients: tuple[float, ...]) -> float:
+    """Return the least r^2 at which the radial part of `brown` no longer grows; inf without one."""
+    k1, k2, _, _, k3, *below = coefficients
+    over, under = Polynomial((1, k1, k2, k3)), Polynomial((1, *below))
+    s = Polynomial((0, 1))
+    # d/dr of r over(r^2) / under(r^2), times under^2
+    slope = over * under + 2 * s * (over.deriv() * under - over * under.deriv())
+    roots = np.concatenate([slope.trim().roots(), under.trim().roots()])
+    real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
+    return float(real.min(initial=np.inf))
 
 
 @dataclass(frozen=True)

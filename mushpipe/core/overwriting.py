@@ -41,13 +41,13 @@ def spare_files(read: Iterable[Path], written: Mapping[str, Iterable[Path]]) -> 
     """Refuse what sinks could not write, or not without harm, before any of them opens.
 
     Args:
-        read: Files of the source.
+        read: What the run reads.
         written: Files of each sink, by its name.
 
     Raises:
-        UsageError: A sink would write over what is played or another sink's file, or cannot write.
+        UsageError: A sink would write over what is read or another sink's file, or cannot write.
     """
-    taken = [("its own source", path) for path in read]
+    taken = [("what the run reads,", path) for path in read]
     for name, paths in written.items():
         for path in paths:
             for whose, other in taken:

@@ -59,6 +59,16 @@ class Plan:
     overrides: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
+    def into(self, folder: Path) -> Plan:
+        """Return a plan whose sinks write into a folder of their own within one."""
+
+        def moved(node: Node) -> Node:
+            if not isinstance(node.plugin, Sink):
+                return node
+            return replace(node, plugin=node.plugin.into(folder / node.name))
+
+        return replace(self, sinks=tuple(map(moved, self.sinks)))
+
     def fresh(self) -> Plan:
         """Return a plan whose plugins have no state yet."""
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import logging
 import os
+import re
 import sys
 import traceback
 import zlib
@@ -22,6 +24,8 @@ import pluggy
 
 from mushpipe.core.errors import DependencyError, PluginError, suggest
 from mushpipe.core.stage import Kind, Plugin, kind_of
+
+logger = logging.getLogger("mushpipe")
 
 GROUP = "mushpipe"
 hookspec = pluggy.HookspecMarker(GROUP)
@@ -153,10 +157,19 @@ def load_registry() -> Registry:
     found = sorted(entry_points(group=GROUP), key=lambda e: (_owner(e)[0] != GROUP, _owner(e)))
     wanted = os.environ.get("MUSHPIPE_PLUGINS")
     if wanted is not None:
-        keep = {GROUP, *map(str.strip, wanted.split(","))}
-        found = [point for point in found if _owner(point)[0] in keep]
+        keep = {GROUP, *(_normal(name.strip()) for name in wanted.split(","))}
+        found = [point for point in found if _normal(_owner(point)[0]) in keep]
+        unknown = keep - {"", *(_normal(_owner(point)[0]) for point in found)}
+        if unknown:
+            names = ", ".join(sorted(unknown))
+            logger.warning("MUSHPIPE_PLUGINS: no plugins are installed by %s", names)
     register(registry, found)
     return registry
+
+
+def _normal(distribution: str) -> str:
+    """Return the name by which a distribution is known, however it is written (PEP 503)."""
+    return re.sub(r"[-_.]+", "-", distribution).lower()
 
 
 def register(registry: Registry, points: Iterable[EntryPoint]) -> None:

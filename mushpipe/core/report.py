@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from mushpipe.core.errors import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_OK, MushpipeError
@@ -65,7 +66,8 @@ class RunReport:
     looked at because the run ended early. ``manifest`` says what the run was made of.
     ``durations`` holds what each node takes for a frame, source and sinks on threads of their own;
     ``frame`` the sum of the stages; ``latency`` the time from when a frame left the source until
-    what was found in it is handed to the sinks.
+    what was found in it is handed to the sinks. ``elapsed_s`` counts from when all is open.
+    ``files`` are those that sinks write.
     """
 
     manifest: dict[str, Any] = field(default_factory=dict)
@@ -81,6 +83,7 @@ class RunReport:
     frame: Durations = field(default_factory=Durations)
     latency: Durations = field(default_factory=Durations)
     elapsed_s: float = 0.0
+    files: tuple[Path, ...] = ()
     interrupted: bool = False
     error: MushpipeError | None = None
     capsules: list[str] = field(default_factory=list)

@@ -16,6 +16,7 @@ from mushpipe.core.edges import (
     SourceThread,
     failure,
     files_of,
+    files_read,
     interruptible_opening,
     named,
 )
@@ -97,11 +98,13 @@ class _Runner:
             reader = SourceThread(self.plan.source, source, threading.Event(), durations)
             info = self._begin(source, reader)
             written = {node.name: files_of(node, info) for node in self.plan.sinks}
-            spare_files(files_of(self.plan.source), written)
+            spare_files(files_read(self.plan), written)
             # Who writes a file empties it: not before all that may fail without has opened.
             sinks = sorted(self.plan.sinks, key=lambda node: bool(written[node.name]))
             for node in (*self.plan.stages, *sinks):
                 stack.enter_context(_opened(node, _opener(node, info)))
+            self.report.files = tuple(path for paths in written.values() for path in paths)
+            self.started = time.monotonic()  # what opening took is no part of the frames' pace
             threads = [self._sink_thread(node) for node in self.plan.sinks]
             stack.enter_context(cores_shared())
             try:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from inspect import Parameter, signature
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo
@@ -93,6 +93,12 @@ class Plugin(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    def given_files(self) -> tuple[Path, ...]:
+        """Return the files that its settings name to be read, such as a model."""
+        settings = type(self).model_fields.items()
+        values = (getattr(self, name) for name, setting in settings if not _is_written(setting))
+        return tuple(value for value in values if isinstance(value, Path))
 
     def close(self) -> None:
         """Release what `open` took; also called after a failure, and after a failed `open`."""
@@ -181,6 +187,13 @@ class Sink(Plugin):
         """Return the files it writes; if not overridden, those of settings of type `SinkPath`."""
         paths = (getattr(self, n) for n, f in type(self).model_fields.items() if _is_written(f))
         return tuple(run.path(path) for path in paths if path not in (None, STDIO))
+
+    def into(self, folder: Path) -> Self:
+        """Return a copy that writes the files of its settings of type `SinkPath` into a folder."""
+        names = (name for name, setting in type(self).model_fields.items() if _is_written(setting))
+        paths = {name: getattr(self, name) for name in names}
+        moved = {n: folder / path.name for n, path in paths.items() if path not in (None, STDIO)}
+        return self.model_copy(update=moved)
 
     def finish(self, summary: Mapping[str, Any]) -> None:
         """Take the run's counts and timings, after the last frame and before `close`."""

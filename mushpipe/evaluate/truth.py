@@ -85,7 +85,7 @@ def truth_of_recording(path: Path) -> TruthSet:
         InputError: It has none, or a message on it cannot be read.
     """
     reader = RecordingReader(path)
-    frames: dict[Place, FrameTruth] = {}
+    found: list[tuple[Header, FrameTruth]] = []
     for raw in reader.messages({TRUTH_TOPIC}):
         name = raw.schema.name if raw.schema else ""
         try:
@@ -95,9 +95,13 @@ def truth_of_recording(path: Path) -> TruthSet:
         if decoded is None or not isinstance(decoded.table, Truth):
             raise InputError(f"{path}: {TRUTH_TOPIC} holds '{name}', expected mushpipe.Truth")
         header = decoded.header
-        frames["stamp_ns", header.stamp_ns] = FrameTruth(decoded.table, frame_id=header.frame_id)
-    if not frames:
+        found.append((header, FrameTruth(decoded.table, frame_id=header.frame_id)))
+    if not found:
         raise InputError(f"{path}: it carries no truth (no messages on {TRUTH_TOPIC})")
+    frames: dict[Place, FrameTruth]
+    frames = {("stamp_ns", header.stamp_ns): truth for header, truth in found}
+    if len(frames) < len(found):  # stamps stood still
+        frames = {("index", header.sequence): truth for header, truth in found}
     return TruthSet(path.name, frames, tuple(reader.damage))
 
 

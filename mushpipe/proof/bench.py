@@ -38,22 +38,21 @@ def bench(plan_of: Callable[[int], Plan], frames: int) -> dict[str, Any]:
     """
     _run(plan_of(WARM_UP_FRAMES))
     allocated = _allocated_mb(plan_of(TRACED_FRAMES))
-    memory = _Memory()
-    cpu = time.process_time()
-    report = _run(plan_of(frames), memory)
-    cpu = time.process_time() - cpu
+    watch = _Watch()
+    report = _run(plan_of(frames), watch)
+    cpu, elapsed = watch.cpu_s(), report.elapsed_s
     summary = report.summary()
     return {
         "graph": report.manifest["graph_file"],
         "recordings": report.manifest["recordings"],
         "machine": machine(),
         "frames": report.processed,
-        "frames_per_s": round(report.processed / report.elapsed_s, 2),
+        "frames_per_s": round(report.processed / elapsed, 2),
         "cpu_ms_per_frame": round(1e3 * cpu / report.processed, 2),
-        "cores_busy": round(cpu / report.elapsed_s, 2),
+        "cores_busy": round(cpu / elapsed, 2),
         "allocated_mb_per_frame": allocated,
         "peak_memory_mb": round(_peak_mb(), 1),
-        "memory_growth_mb": round(memory.growth_mb(), 2),
+        "memory_growth_mb": round(watch.growth_mb(), 2),
         "nodes": summary["durations"],
         "frame": summary["frame"],
         "latency": summary["latency"],
@@ -87,16 +86,23 @@ def _run(plan: Plan, progress: Progress | None = None) -> RunReport:
     return report
 
 
-class _Memory:
-    """Resident memory over a run: what it grew by after its first fifth."""
+class _Watch:
+    """CPU time and resident memory at each frame of a run."""
 
     def __init__(self) -> None:
         self.seen_mb: list[float] = []
+        self.seen_s: list[float] = []
 
     def __call__(self, report: RunReport) -> None:
         del report
         pages = int(Path("/proc/self/statm").read_text().split()[1])
         self.seen_mb.append(pages * resource.getpagesize() / 1e6)
+        self.seen_s.append(time.process_time())
+
+    def cpu_s(self) -> float:
+        """Return the CPU time of all frames, from that between the first and the last."""
+        count = len(self.seen_s)
+        return (self.seen_s[-1] - self.seen_s[0]) * count / max(count - 1, 1)
 
     def growth_mb(self) -> float:
         """Return mean of the last fifth less mean of the second fifth."""
@@ -138,15 +144,18 @@ def slower(result: Mapping[str, Any], baseline: Mapping[str, Any]) -> dict[str, 
     }
 
 
-def read_baseline(path: Path) -> dict[str, Any]:
-    """Read figures that `mushpipe bench --json` wrote.
+def read_baseline(path: Path, graph: Path) -> dict[str, Any]:
+    """Read figures of a graph that `mushpipe bench --json` wrote.
 
     Raises:
-        UsageError: The file cannot be read, or holds something else.
+        UsageError: The file cannot be read, or holds something else, or those of another graph.
     """
     try:
         content: dict[str, Any] = json.loads(path.read_text())
         content["nodes"], content["frame"]["p50_ms"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UsageError(f"{path}: no figures of 'mushpipe bench --json': {error}") from error
+    measured = Path(content.get("graph", graph)).name
+    if measured != graph.name:
+        raise UsageError(f"{path}: the figures are those of {measured}, not of {graph.name}")
     return content

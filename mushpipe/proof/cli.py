@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -88,21 +89,28 @@ def bench(
         float, typer.Option(help="exit with 3 where a median is more times the baseline's", min=1)
     ] = 1.5,
 ) -> None:
-    """Measure a graph: time of every node, latency, frames/s, CPU, memory."""
+    """Measure a graph: time of every node, latency, frames/s, CPU, memory.
+
+    What its sinks write goes to a temporary folder.
+    """
     from mushpipe.console import set_up_logging
     from mushpipe.core.document import read_document
+    from mushpipe.core.edges import files_read
     from mushpipe.core.errors import EXIT_DIFFERS
     from mushpipe.core.graph import compile_document
-    from mushpipe.core.overwriting import require_writable
+    from mushpipe.core.overwriting import require_writable, spare
     from mushpipe.core.plugins import load_registry
     from mushpipe.proof.bench import bench as measure
     from mushpipe.proof.bench import read_baseline, slower
 
     set_up_logging(False)
     require_writable(out)
-    before = read_baseline(baseline) if baseline else None
+    before = read_baseline(baseline, graph) if baseline else None
     plan = compile_document(read_document(graph), load_registry(), set_ or [], recording)
-    result = measure(lambda count: _endless(plan, count, speed), frames)
+    spare(out, *files_read(plan))
+    with TemporaryDirectory(prefix="mushpipe-bench-") as folder:
+        plan = plan.into(Path(folder))  # results of a run stay as they are
+        result = measure(lambda count: _endless(plan, count, speed), frames)
     ratios = slower(result, before) if before else {}
     _show(result, ratios)
     if out is not None:

@@ -13,11 +13,12 @@ Performance of the Intel SR300 Depth Camera"), not a measurement.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from mushpipe.sim.material import Paint
 from mushpipe.sim.noise import Floats, Singles, blurred, generator
@@ -68,6 +69,12 @@ class DepthSensor(BaseModel):
     edges: bool = Field(True, description="jitter, flying pixels and losses at depth edges")
     range_m: tuple[float, float] = Field((0.2, 1.5), description="nearest and farthest depth, m")
 
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if not 0 <= self.range_m[0] < self.range_m[1]:
+            raise ValueError("range_m must be [nearest, farthest]")
+        return self
+
     def scan(self, world: World, view: View, surface: Surface, paint: Paint, seed: int) -> Exact:
         """Return exact depth and the holes that stay as long as nothing moves."""
         depth = surface.depth.reshape(surface.shape).astype(np.float32)
@@ -88,15 +95,17 @@ class DepthSensor(BaseModel):
         """Return the depth image (H, W) uint16 in units of `unit_mm`, 0 where missing."""
         rng = generator(seed, "depth frame", frame)
         depth, lost = exact.depth, exact.lost.copy()
+        # Drawn in any case: switching a fault off must not change the noise.
+        jittered, torn = _edges(depth, rng)
+        holes = _random_holes(depth.shape, self.random_holes, rng)
         if self.edges:
-            depth, torn = _edges(depth, rng)
-            lost |= torn
-        if self.random_holes:
-            lost |= _random_holes(depth.shape, self.random_holes, rng)
+            depth, lost = jittered, lost | torn
+        lost |= holes
         error = self.noise * axial_sigma(depth) * self._pattern(depth.shape, seed, rng)
         measured = depth + error + np.float32(self.offset_mm / 1000)
         units = np.rint(measured.astype(np.float64) / (self.unit_mm / 1000))
-        return np.where(lost, 0, np.clip(units, 0, 65535)).astype(np.uint16)
+        lost |= units > np.iinfo(np.uint16).max
+        return np.where(lost, 0, np.maximum(units, 0)).astype(np.uint16)
 
     def _pattern(self, shape: tuple[int, ...], seed: int, rng: np.random.Generator) -> Singles:
         """Return noise (H, W) of standard deviation 1, or less where parts are switched off."""

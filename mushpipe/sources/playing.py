@@ -99,7 +99,7 @@ class Player:
         self._factories = (ProtobufDecoders(), Ros2Decoders())
         self._calibrated = ""  # frame of the calibration
         self._judged = False  # whether there was depth to be judged
-        self._found_beside: dict[int, dict[str, wire.Message]] = {}
+        self._found_beside: dict[tuple[int, int], dict[str, wire.Message]] = {}
 
     def wanted(self) -> set[str]:
         """Return the topics of the messages that `play` takes."""
@@ -148,13 +148,14 @@ class Player:
         name, encoding, data = (given.name, given.encoding, given.data) if given else ("", "", b"")
         schema = wire.Schema(name, encoding, data, raw.channel.message_encoding)
         message = wire.Message("", schema, raw.message.data, raw.channel.metadata)
-        found = self._found_beside.setdefault(raw.message.publish_time, {})
+        place = (raw.message.publish_time, raw.message.sequence)  # stamps may stand still
+        found = self._found_beside.setdefault(place, {})
         found[raw.channel.topic] = message
 
     def _with_beside(self, frame: RgbdFrame) -> RgbdFrame:
-        stamp_ns = frame.header.stamp_ns
-        attached = self._found_beside.pop(stamp_ns, {})
-        for passed in [stamp for stamp in self._found_beside if stamp < stamp_ns]:
+        place = (frame.header.stamp_ns, frame.header.sequence)
+        attached = self._found_beside.pop(place, {})
+        for passed in [each for each in self._found_beside if each < place]:
             del self._found_beside[passed]
         return replace(frame, attached=attached) if attached else frame
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from mushpipe import Header, ReplaySource, RgbdFrame
 from mushpipe.core.truth import INSTANCES_TOPIC, TRUTH_TOPIC
@@ -36,6 +37,12 @@ class SyntheticSource(SceneSettings, ReplaySource):
     gap_s: float = Field(2, ge=0, description="length of the gap, s")
     color: ColorCamera = Field(ColorCamera(), description="the colour camera")
     sensor: DepthSensor = Field(DepthSensor(), description="the depth camera")
+
+    @model_validator(mode="after")
+    def _moves(self) -> Self:
+        if self.step_mm and not self.travel_mm:
+            raise ValueError("step_mm moves the camera, and travel_mm 0 keeps it where it is")
+        return self
 
     def name(self) -> str:
         """Return the name of the scene and its seed."""

@@ -36,6 +36,7 @@ EDGE_PX = 2.0  # sigma of a depth edge
 # Noise and errors of shape are correlated; so much of a point, or of a ray along an edge, counts.
 POINT_SHARE, EDGE_SHARE = 0.35 * 169 / GRID**2, 0.6
 ASTRAY = 1 / 3  # share of other depth in a circle: is what its centre shows the cap at all?
+CROWDED = 6.0  # px; in a smaller circle cells of the grid share pixels, each of which counts once
 CORE = 0.35  # squared share of the radius inside which the middle depth is taken
 
 _TURN = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
@@ -80,6 +81,8 @@ def sample_depth(
     step = (0.6 * size * (2 * half + 1) / radius) ** 2
     n, other = 0, 0
     for j in range(len(CELLS)):
+        if radius < CROWDED and _taken(cut.pixels, j):
+            continue
         z = blocks[j + DEPTH * K]
         sigma = sensor[0] + sensor[1] * z
         even = (2.5 * sigma) ** 2 + step
@@ -96,6 +99,15 @@ def sample_depth(
         out[5, n] = POINT_SHARE
         n += 1
     return n, other, middle
+
+
+@borrower
+def _taken(pixels: NDArray[np.int32], cell: int) -> bool:
+    """Return whether the pixel of a cell is that of a cell before it."""
+    taken = False
+    for k in range(cell):
+        taken |= pixels[k] == pixels[cell] and pixels[k + K] == pixels[cell + K]
+    return taken
 
 
 @borrower

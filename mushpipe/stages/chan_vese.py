@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from mushpipe import Mask, RgbdFrame, Stage
-from mushpipe.stages.channels import MANY, Channel, channel_image
+from mushpipe.stages.channels import MANY, Channel, channel_image, inverted
 from mushpipe.stages.otsu import initial_contour
 from mushpipe.stages.polarity import rise
 from mushpipe.stages.warm_up import example_frame
@@ -55,10 +55,10 @@ class ChanVese(Stage):
         """Return the mask with the contour it started from."""
         image = channel_image(frame, self.channel)
         if self.polarity == "dark":
-            image = 1 - image
+            image = inverted(image, self.channel)
         found = initial_contour(image, self.check)
         if self.polarity == "auto" and rise(frame, found.region) < -SUNKEN_M:
-            image = 1 - image
+            image = inverted(image, self.channel)
             found = initial_contour(image, self.check)
         initial = found.region
         if not initial.any() or initial.all():

@@ -36,6 +36,14 @@ def channel_image(frame: RgbdFrame, channel: Channel) -> Plane:
     return _stretched(cv2.GaussianBlur(frame.color, (5, 5), 1.0), channel)
 
 
+def inverted(image: Plane, channel: Channel) -> Plane:
+    """Return an image of a channel with dark caps bright; height stays as it is."""
+    result = 1 - image
+    if channel == "gray+height" and image.ndim == 3:
+        result[..., 1] = image[..., 1]
+    return result
+
+
 def _stretched(color: Any, channel: str) -> Plane:
     """Return the channel ``a`` or ``red-blue`` of a blurred image, (H, W) from 0 to 1."""
     if channel == "a":

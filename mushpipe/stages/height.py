@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Self
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from mushpipe import Mask, RgbdFrame, Stage
 from mushpipe.core.jit import jit
@@ -31,6 +33,12 @@ class Height(Stage):
         10, ge=0, description="diameter of the smallest piece that is kept: clods and pins are less"
     )
     relief: bool = Field(True, description="follow the relief of the soil; false for a table")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.min_mm >= self.max_mm:
+            raise ValueError("min_mm must be less than max_mm")
+        return self
 
     def open(self) -> None:
         """Compile the kernels."""

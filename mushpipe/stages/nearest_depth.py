@@ -26,7 +26,9 @@ class NearestDepth(Stage):
     depth inside the circle on its own side.
     """
 
-    neighbours: int = Field(4, ge=1, description="how many nearest points stand in for a missing")
+    neighbours: int = Field(
+        4, ge=1, le=1000, description="how many nearest points stand in for a missing"
+    )
 
     def open(self) -> None:
         """Compile the kernels."""
@@ -57,10 +59,12 @@ class NearestDepth(Stage):
             # The centre pixel is the one the centre rounds to.
             measured = (found > 0) & (off <= 0.5)
             points[measured, 1:] = np.nan
-            some = found > 0
+            seen = np.asarray(np.isfinite(points).all(axis=2))  # the lens may have no ray there
+            points[~seen] = np.nan
+            some = seen.any(axis=1)
             position[some] = np.nanmean(points[some], axis=1)
             source[some] = DepthSource.NEIGHBOURS
-            source[measured] = DepthSource.MEASURED
+            source[measured & some] = DepthSource.MEASURED
             rim = np.full((n, 4), np.nan)
             ends(depth, discs, rim)
             corners = circles.center[:, None] + circles.radius[:, None, None] * _SIDES

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mushpipe import RgbdFrame
 from mushpipe.core.jit import inlined, jit
-from mushpipe.stages.bed import far_cells, fit_plane
+from mushpipe.stages.bed import far_cells, fit_plane, plane_depth
 from mushpipe.stages.phase_edges import Edges, Plane, depth_edges
 
 CELL = 2  # px of the image per px of the height map
@@ -98,15 +98,22 @@ class Relief:
         height: (h, w) m over the bed at half resolution, -1 where unknown.
         filled: (h, w) m, the same with narrow gaps `closed`.
         depth: (h, w) m, -1 where unknown.
+        plane: (3,) of the bed at half resolution, from `fit_plane`.
         focal: px of the full image.
-        pixel: Size of a pixel of the full image on the bed, m.
+        pixel: Size of a pixel of the full image on the bed, m, in the middle of what is seen.
     """
 
-    def __init__(self, depth: Plane, height: Plane, focal: float) -> None:
-        self.depth, self.height, self.focal = depth, height, focal
+    def __init__(
+        self, depth: Plane, height: Plane, plane: NDArray[np.float64], focal: float
+    ) -> None:
+        self.depth, self.height, self.plane, self.focal = depth, height, plane, focal
         self.filled = closed(height)
         known = depth[depth > 0]
         self.pixel = float(np.median(known[:: max(1, len(known) // 2000)])) / focal
+
+    def bed_pixel(self, x: Any, y: Any) -> NDArray[np.float64]:
+        """Return the size, m, of a pixel of the full image on the bed at x, y (px)."""
+        return plane_depth(self.plane, (x - 0.5) / CELL, (y - 0.5) / CELL) / self.focal
 
     def edges(self) -> Edges:
         """Return the depth discontinuities, in px of the height map."""
@@ -127,7 +134,7 @@ def relief_of(frame: RgbdFrame) -> Relief | None:
     plane = fit_plane(far_cells(depth, GRID))
     if plane is None:
         return None
-    return Relief(depth, _heights(depth, plane), (frame.camera.fx + frame.camera.fy) / 2)
+    return Relief(depth, _heights(depth, plane), plane, (frame.camera.fx + frame.camera.fy) / 2)
 
 
 NO_RELIEF = np.zeros((0, 0), np.float32)

@@ -183,6 +183,10 @@ def depth_edges(height: Plane, threshold: float) -> Edges:
 
 def _thin_edges(grad: Gradient, region: NDArray[np.uint8], threshold: float) -> tuple[Plane, Rows]:
     index = np.full(grad.size.shape, -1, np.int32)
-    points = np.empty((7, grad.size.size // 6 + 16), np.float32)
+    room, pixels = grad.size.size // 6 + 16, grad.size.size
+    points = np.empty((7, room), np.float32)
     count = thin(*grad, region, threshold, points, index)
+    if count == room:  # a grainy image; with room for the worst at once every frame would be slower
+        points = np.empty((7, pixels), np.float32)
+        count = thin(*grad, region, threshold, points, index)
     return points[:, :count], index

@@ -61,6 +61,7 @@ class Evidence:
         middle: (N,) m height of the middle over the bed, NaN without depth.
         height: (h, w) m over the bed at half resolution, empty without depth.
         pixel: Size of a pixel on the bed, m.
+        range: Smallest and largest radius, px.
     """
 
     edges: Strips
@@ -70,6 +71,7 @@ class Evidence:
     middle: Table
     height: Plane
     pixel: float
+    range: tuple[float, float]
 
 
 class PhaseHough(Stage):
@@ -152,19 +154,21 @@ class PhaseHough(Stage):
         after = np.logical_or.accumulate(score < _LIKELY)
         score[after] = np.minimum.accumulate(score[after])
         owner[np.isin(owner, np.flatnonzero(after))] = -1
-        polish(found.edges, found.height, found.pixel, shapes, owner)
+        polish(found.edges, found.height, found.pixel, shapes, owner, *found.range)
         return Circles(shapes[:, :2], equal_area_radius(shapes), score)
 
     def gather(
         self, frame: RgbdFrame, mask: Mask, learned: Circles | None = None
     ) -> Evidence | None:
-        """Return candidates with their features; None where an image cannot hold a circle."""
+        """Return candidates with their features; None where the image cannot hold such a circle."""
         height, width = mask.foreground.shape
         if min(height, width) < _SMALLEST:
             return None
         literal = self.input == "mask"
         relief = relief_of(frame) if self.use_depth and not literal else None
         smallest, largest = self._range(relief, height, width)
+        if smallest >= largest:
+            return None
         image = _levels(frame, mask, literal)
         gradient = gradient_of(image)
         inside = mask.foreground.view(np.uint8)
@@ -192,7 +196,9 @@ class PhaseHough(Stage):
         kept = self._plausible(shapes, middle, relief)
         if learned is not None:
             kept &= np.isfinite(middle) | (table[:, NAMES.index(LEARNED)] >= _SEEN)
-        return Evidence(edges, shapes[kept], hits[kept], table[kept], middle[kept], high, pixel)
+        limits = (smallest, largest)
+        parts = (shapes[kept], hits[kept], table[kept], middle[kept])
+        return Evidence(edges, *parts, high, pixel, limits)
 
     def decide(self, found: Evidence) -> tuple[Rows, Table, Rows]:
         """Return the accepted rows in their order, all probabilities, and whose each edge is."""
@@ -214,10 +220,11 @@ class PhaseHough(Stage):
         smallest, largest = self.radius_px or (8.0, 38.0)
         if self.radius_px is None and relief is not None:
             # a cap is nearer than the bed, hence larger in the image
-            smallest, largest = (d / 2000 / relief.pixel for d in self.diameter_mm)
-            smallest, largest = max(5.0, smallest), 1.2 * largest
-        largest = min(largest, max(height, width) / 2)
-        return min(smallest, 0.9 * largest), largest
+            near = relief.bed_pixel(*np.array([(0, width, 0, width), (0, 0, height, height)]))
+            least, most = self.diameter_mm
+            smallest = max(5.0, least / 2000 / near.max())
+            largest = 1.2 * most / 2000 / near.min()
+        return smallest, min(largest, max(height, width) / 2)
 
     def _edges(
         self, image: Plane, gradient: Gradient, region: Bytes, relief: Relief | None
@@ -233,7 +240,8 @@ class PhaseHough(Stage):
         inside = np.ones(len(shapes), bool)
         if relief is not None:
             nearer = np.nan_to_num(middle) / relief.focal
-            diameter = 2000 * shapes[:, 2] * (relief.pixel - nearer)
+            bed = relief.bed_pixel(shapes[:, 0], shapes[:, 1])
+            diameter = 2000 * shapes[:, 2] * (bed - nearer)
             low, high = self.diameter_mm
             inside = ~np.isfinite(middle) | ((diameter >= low) & (diameter <= high))
         return inside

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from mushpipe.core.jit import borrower, jit
+from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE
 from mushpipe.stages.phase_decide import covered
 from mushpipe.stages.phase_edges import Plane, Rows, Shape, Singles
 from mushpipe.stages.phase_refit import NARROW, Table, around, fit_outline
@@ -61,11 +62,15 @@ def _keep_own(
 
 
 @jit
-def polish(edges: Strips, height: Plane, pixel: float, outlines: Table, owner: Rows) -> None:
+def polish(
+    edges: Strips, height: Plane, pixel: float, outlines: Table, owner: Rows,
+    smallest: float, largest: float,
+) -> None:  # fmt: skip
     """Refit accepted outlines (K, 5), in their order and in place, to what is theirs alone.
 
     Edges of others do not count, nor those within or just outside a circle that was accepted
-    before: where a cap dips under another one, its steepest shading is not its outline.
+    before: where a cap dips under another one, its steepest shading is not its outline. What leaves
+    the range of radii, px, stays as it was.
     """
     scratch, places = scratch_for(len(edges.x)), np.empty((2, len(edges.x)), np.float32)
     shape, near = np.empty(5), np.empty_like(outlines)
@@ -77,5 +82,6 @@ def polish(edges: Strips, height: Plane, pixel: float, outlines: Table, owner: R
         moved = fit_outline(edges, kept, shape, NARROW, scratch) if kept >= OWN else False
         limit = max(1.5, 0.15 * outlines[k, 2])
         away = math.hypot(shape[0] - outlines[k, 0], shape[1] - outlines[k, 1])
-        if moved and abs(shape[2] - outlines[k, 2]) < limit and away < limit:
+        within = smallest * LEAST_OF_RANGE <= shape[2] <= largest * MOST_OF_RANGE
+        if moved and within and abs(shape[2] - outlines[k, 2]) < limit and away < limit:
             outlines[k] = shape

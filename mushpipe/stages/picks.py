@@ -20,6 +20,7 @@ from mushpipe.stages.tracks import Tracks
 logger = logging.getLogger("mushpipe")
 SMALLEST_MM = 1.0
 HEIGHT = 0.3  # of a usual cap, in diameters
+ASTRAY = 3.0  # radii; the apex of a leaning cap is seen up to two from the middle of its circle
 Rank = Literal["unoccluded", "highest", "largest", "score"]
 FlagName = Literal[
     "depth_missing",
@@ -138,7 +139,7 @@ class MakePicks(Stage):
         poses: Poses,
         hidden: NDArray[np.float64],
     ) -> NDArray[np.uint32]:
-        reach = circles.radius[:, None]
+        reach, tilt_sigma = circles.radius[:, None], np.radians(self.tilt_sigma_deg)
         cut = (circles.center < reach) | (circles.center + reach > np.array(image) - 1)
         flags = np.zeros(len(circles), np.uint32)
         for flag, where in (
@@ -147,7 +148,7 @@ class MakePicks(Stage):
             (PickFlag.POSE_UNKNOWN, ~poses.valid),
             (PickFlag.AT_BORDER, cut.any(axis=1)),
             (PickFlag.OCCLUDED, hidden > self.occluded_share),
-            (PickFlag.TILT_UNOBSERVABLE, poses.sigma_rad >= np.radians(self.tilt_sigma_deg)),
+            (PickFlag.TILT_UNOBSERVABLE, poses.valid & ~(poses.sigma_rad < tilt_sigma)),
             (
                 PickFlag.TOO_CLOSE_TO_NEIGHBOUR,
                 1000 * clearance(circles, locations) < self.clearance_mm,
@@ -200,7 +201,7 @@ def _require_same(
     if frame.camera is None:
         return
     seen = frame.camera.project(points)
-    away = np.linalg.norm(seen - circles.center, axis=1) > 2 * circles.radius
+    away = np.linalg.norm(seen - circles.center, axis=1) > ASTRAY * circles.radius
     if away.any():
         row = int(np.flatnonzero(away)[0])
         (u, v), (x, y) = circles.center[row], seen[row]

@@ -70,7 +70,7 @@ class Registration(Stage):
     voxel: float = Field(0.12, gt=0.01, le=1, description="voxel, in radii of the cap")
     up: Up = "bed"
     steepest_deg: float = Field(
-        60, gt=0, le=180, description="a global registration that leans more has failed, degrees"
+        60, gt=0, le=180, description="what leans more has failed: no start, and no pose, degrees"
     )
     min_points: int = Field(30, ge=10, description="fewest points of a mushroom, after thinning")
 
@@ -115,7 +115,7 @@ class Registration(Stage):
         """Register the mushroom of one row; the same seed gives what a run of all rows gives.
 
         Returns:
-            None where it has too few points or no location.
+            None where it has too few points or no location, or leans more than `steepest_deg`.
 
         Raises:
             InputError: The frame has no calibration.
@@ -145,7 +145,7 @@ class Registration(Stage):
             up: (3,) unit, how the model stands at the start.
 
         Returns:
-            None where there are too few points.
+            None where there are too few points, or where it leans more than `steepest_deg`.
         """
         o3d, model = import_open3d(), self._model
         if not isinstance(model, Model) or len(points) < self.min_points:
@@ -164,6 +164,8 @@ class Registration(Stage):
                 start = np.eye(4)  # a smooth cap fits upside down as well
             result = self._refine(o3d, source, target, start)
         total = np.asarray(result.transformation)
+        if up @ total[:3, :3] @ up < np.cos(np.radians(self.steepest_deg)):
+            return None  # ICP ran away
         axis = total[:3, :3] @ turn @ model.axis
         apex = total[:3, :3] @ (turn @ (model.top * model.axis)) + total[:3, 3]
         before, sample = np.asarray(source.points), np.asarray(target.points)
@@ -249,5 +251,6 @@ def _inside(
         return np.zeros((0, 3))
     middle = np.median(z[inside])
     inside &= (z > middle - 0.8 * size) & (z < middle + size)
+    inside &= rays[top:bottom, left:right, 0] < 1e3  # where the lens has none
     xy = rays[top:bottom, left:right][inside].astype(np.float64)
     return np.column_stack([xy * z[inside, None], z[inside]])

@@ -185,3 +185,29 @@ def test_quaternions_take_z_to_the_axis_without_spin(vectors):
 def test_quaternions_by_hand(axis, quaternion):
     found = quaternion_from_axis(np.array([axis], float))
     np.testing.assert_allclose(found, [quaternion], atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        (-0.35, 0, 0, 0, 0),
+        (-0.28, 0.07, 0.0002, 0, -0.01),
+        (-0.5, 0.1, 0, 0, 0, -0.1, 0, 0),
+    ],
+)
+@pytest.mark.parametrize("focal", [200.0, 300.0, 450.0])
+def test_no_ray_lies_on_the_other_side_of_the_axis(lens: tuple[float, ...], focal: float) -> None:
+    model = "brown_conrady" if len(lens) == 5 else "rational"
+    camera = Camera(640, 480, focal, focal, 319.5, 239.5, model, lens)
+    v, u = np.mgrid[:480:5, :640:5]
+    pixels = np.stack([u, v], axis=-1).reshape(-1, 2).astype(float)
+    ray = camera.deproject(pixels, np.ones(len(pixels)))[:, :2]
+    aside = pixels - (319.5, 239.5)
+    known = np.isfinite(ray).all(axis=1)
+    assert known.any()
+    assert not known.all() or focal == 450  # these lenses end within the image
+    assert ((ray * aside).sum(axis=1)[known] >= -1e-3).all()
+    # farther out on the image is farther out on the ray, as far as the model goes
+    order = np.argsort(np.hypot(*aside[known].T))
+    reach = np.maximum.accumulate(np.hypot(*ray[known][order].T))
+    assert (reach - np.hypot(*ray[known][order].T)).max() < 0.05

@@ -18,7 +18,8 @@ EXACT = 6.0  # px of the image: three of the map; heights are looked at in every
 
 
 def relief(height: np.ndarray) -> Relief:
-    return Relief(np.full(height.shape, 0.4, np.float32), height.astype(np.float32), 600.0)
+    depth = np.full(height.shape, 0.4, np.float32)
+    return Relief(depth, height.astype(np.float32), np.array([1 / 0.4, 0, 0]), 600.0)
 
 
 def disc(x: float, y: float, r: float, height: float = 0.05) -> np.ndarray:

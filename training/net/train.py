@@ -19,11 +19,9 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from training.net.augment import crop
 from training.net.model import CapNet, loss_of
-from training.net.muon import Muon
 from training.net.scenes import TRAINING, TRAINING_SEED, Picture, picture
 
-SIZE, BATCH, DECAY = 224, 8, 0.998
-RATE, TURN = 2.5e-3, 0.02  # largest rates of learning: of AdamW and of Muon
+SIZE, BATCH, RATE, DECAY = 224, 8, 2.5e-3, 0.998
 NEAR = 0.3  # share of the crops that are taken around a cap
 
 Batch = tuple[torch.Tensor, ...]
@@ -55,37 +53,27 @@ def averaged(slow: nn.Module, fast: nn.Module, step: int) -> None:
                 a.copy_(b)
 
 
-def optimizers(net: CapNet) -> tuple[torch.optim.Optimizer, torch.optim.Optimizer]:
-    """Return Muon for what mixes channels, and AdamW for the rest and the output itself."""
-    last = net.head[-1].weight
-    weights = [each for each in net.parameters() if each is not last]
-    mixing = [each for each in weights if each.ndim == 4 and each.shape[1] > 1]
-    rest = [each for each in net.parameters() if all(each is not other for other in mixing)]
-    return Muon(mixing, TURN), torch.optim.AdamW(rest, RATE, weight_decay=1e-3)
-
-
 def train(net: CapNet, batches: Iterable[Batch], steps: int, rate: float, out: Path) -> None:
     """Train a network and write the running mean of its weights, every hundred steps.
 
-    A linear warm-up over 100 steps and a cosine to zero; `rate` is the share of the usual rates.
+    AdamW with a linear warm-up over 100 steps and a cosine to zero.
     """
     net = net.to(memory_format=torch.channels_last)
     slow = copy.deepcopy(net)
-
-    def pace(step: int) -> float:
-        return rate * min(1.0, (step + 1) / 100) * 0.5 * (1 + np.cos(np.pi * step / steps))
-
-    both = optimizers(net)
-    schedules = [torch.optim.lr_scheduler.LambdaLR(each, pace) for each in both]
+    optimizer = torch.optim.AdamW(net.parameters(), rate, weight_decay=1e-3)
+    schedule = torch.optim.lr_scheduler.LambdaLR(
+        optimizer,
+        lambda k: min(1.0, (k + 1) / 100) * 0.5 * (1 + np.cos(np.pi * k / steps)),
+    )
     began, total = time.monotonic(), 0.0
     for step, (image, target, weight) in enumerate(islice(batches, steps)):
-        loss = loss_of(net(image.to(memory_format=torch.channels_last)), target, weight)
-        net.zero_grad()
+        output = net(image.to(memory_format=torch.channels_last))
+        loss = loss_of(output, target, weight)
+        optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(net.parameters(), 5.0)
-        for optimizer, schedule in zip(both, schedules, strict=True):
-            optimizer.step()
-            schedule.step()
+        optimizer.step()
+        schedule.step()
         averaged(slow, net, step)
         total += loss.item()
         if step % 100 == 99:
@@ -102,8 +90,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cache", type=Path, default=Path("out/net"), help="rendered frames")
     parser.add_argument("--frames", type=int, default=TRAINING)
-    parser.add_argument("--steps", type=int, default=10000)
-    parser.add_argument("--rate", type=float, default=1.0, help="share of the usual learning rates")
+    parser.add_argument("--steps", type=int, default=12000)
+    parser.add_argument("--rate", type=float, default=RATE, help="largest learning rate")
     parser.add_argument("--stained", action="store_true", help="blotched and overexposed as well")
     parser.add_argument("--start", type=Path, help="weights to go on from")
     parser.add_argument("--seed", type=int, default=0)
