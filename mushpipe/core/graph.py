@@ -20,6 +20,8 @@ from mushpipe.core.wire import RESULT_PREFIX, TIMING_TOPIC
 from mushpipe.core.wiring import wire
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
+# settings of a source that may hold for one recording and not for the next
+_OF_A_RECORDING = ("camera", "depth_scale", "start", "end")
 
 
 class GraphFile(BaseModel):
@@ -122,6 +124,9 @@ def _replace_source(document: Document, source: str, registry: Registry) -> None
     old = document.data.get("source")
     if isinstance(old, dict) and old.get("use") == given["use"]:
         given = {**old, **given}
+        if kept := [name for name in _OF_A_RECORDING if name in old]:
+            names = ", ".join(kept)
+            document.warnings.append(f"--source keeps the graph's {names}; --set changes that")
     document.data["source"] = given
     label = f"--source {source}"
     document.overrides[("source",)] = label

@@ -34,6 +34,9 @@ def apply_override(document: Document, text: str, label: str = "") -> list[Probl
         if not isinstance(target, dict):
             return [Problem(label, 0, 0, f"'{'.'.join(map(str, at[: depth + 1]))}' has no parts")]
     target[at[-1]] = value
+    for marks in (document.keys, document.values):  # what the file says there no longer holds
+        for place in [each for each in marks if each[: len(at)] == at]:
+            del marks[place]
     document.overrides[at] = label
     return []
 

@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from mushpipe.core.geometry import Camera
 from mushpipe.core.jit import borrower
 from mushpipe.core.tables import Circles
 
@@ -17,6 +18,19 @@ LEAST_OF_RANGE, MOST_OF_RANGE = 0.9, 1.1
 def discs_of(circles: Circles) -> NDArray[np.float64]:
     """Return x, y and radius (N, 3), px."""
     return np.column_stack([circles.center, circles.radius])
+
+
+def radii_on_rays(circles: Circles, camera: Camera) -> NDArray[np.float64]:
+    """Return the radii (N,) of circles on the plane z = 1, NaN where the lens has no rays.
+
+    From the area that two diameters span there: a lens may show a pixel larger or smaller at the
+    border than in the middle.
+    """
+    reach = circles.radius[:, None]
+    ends = [circles.center + reach * np.array(way) for way in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+    right, left, down, up = camera.deproject(np.stack(ends), np.ones((4, len(circles))))[..., :2]
+    (ax, ay), (bx, by) = (right - left).T, (down - up).T
+    return np.asarray(np.sqrt(np.abs(ax * by - ay * bx)) / 2)
 
 
 @borrower

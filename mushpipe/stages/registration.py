@@ -20,6 +20,7 @@ from mushpipe import (
     quaternion_from_axis,
 )
 from mushpipe.core.libraries import import_open3d
+from mushpipe.stages.discs import radii_on_rays
 from mushpipe.stages.upright import Up, pixel_rays, upright
 from mushpipe.stages.upright_model import Model, made, read
 from mushpipe.stages.warm_up import CAMERA, example_frame
@@ -128,7 +129,9 @@ class Registration(Stage):
         if not np.isfinite(position).all():
             return None
         depth, rays = np.fmax(frame.depth_m, np.float32(0)), pixel_rays(frame.camera)
-        size = radius * position[2] / ((frame.camera.fx + frame.camera.fy) / 2)
+        size = float(radii_on_rays(circles, frame.camera)[row] * position[2])
+        if not np.isfinite(size):
+            return None
         points = _inside(depth, rays, circles.center[row], radius, size)
         deeper = 1 + self._model.top * size / locations.distance[row]
         # seeds RANSAC and the tuple test of FGR; ICP and FPFH draw nothing

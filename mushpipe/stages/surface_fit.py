@@ -12,7 +12,7 @@ from mushpipe.core.jit import borrower
 from mushpipe.stages.cap_blocks import CELLS
 from mushpipe.stages.cap_order import Order, by_depth
 from mushpipe.stages.cap_samples import ASTRAY
-from mushpipe.stages.discs import discs_of
+from mushpipe.stages.discs import discs_of, radii_on_rays
 from mushpipe.stages.paraboloid import ASPECT, COEFFICIENTS, SHAPE_M, TIP, fit_surfaces
 from mushpipe.stages.upright import pixel_rays
 from mushpipe.stages.warm_up import example_circles, example_frame
@@ -66,7 +66,7 @@ class SurfaceFit(Stage):
         surface, covariance, seen = fit_tops(depth, frame.camera, discs, noise, self.min_points)
         focal = (frame.camera.fx + frame.camera.fy) / 2
         pixel = self.circle_sigma_px * surface[:, 0] / focal  # its sigma on the cap, m
-        size = circles.radius * surface[:, 0] / focal
+        size = radii_on_rays(circles, frame.camera) * surface[:, 0]
         smooth = without_tip(surface, covariance)
         ray = frame.camera.deproject(circles.center, np.ones(len(circles)))
         position = ray * surface[:, :1]

@@ -23,8 +23,35 @@ def test_a_recording_is_never_written_over_by_its_own_run(folder: Path) -> None:
         *("run", "graph.yaml", "--source", "a.mcap", "--set", "log.path=./a.mcap"), cwd=folder
     )
     assert done.returncode == EXIT_USAGE
-    assert "sink 'log' would write over its own source" in done.stderr
+    assert "sink 'log' would write over what the run reads" in done.stderr
     assert (folder / "a.mcap").read_bytes() == before
+
+
+def test_a_run_writes_over_neither_its_graph_nor_its_plugins(folder: Path) -> None:
+    mushpipe("record", "--source", "synthetic", "--frames", 1, "-o", "a.mcap", cwd=folder)
+    (folder / "mine.py").write_text(
+        "from mushpipe import Mask, RgbdFrame, Stage\n"
+        "class Everything(Stage):\n"
+        "    def process(self, frame: RgbdFrame) -> Mask:\n"
+        "        return Mask(frame.gray >= 0)\n"
+    )
+    (folder / "own.yaml").write_text(
+        "mushpipe: 1\nsource: {use: mcap, path: a.mcap}\n"
+        "stages: {all: {use: ./mine.py:Everything}}\n"
+        "sinks: {log: {use: mcap, path: out.mcap}}\n"
+    )
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    for name in ("own.yaml", "mine.py", "a.mcap"):
+        for option in (("--set", f"log.path=./{name}"), ("--manifest", name)):
+            done = mushpipe("run", "own.yaml", *option, cwd=folder)
+            assert done.returncode == EXIT_USAGE
+            assert name in done.stderr
+        done = mushpipe("bench", "own.yaml", "--frames", 10, "--json", name, cwd=folder)
+        assert done.returncode == EXIT_USAGE
+    assert {path: path.read_bytes() for path in before} == before
+    done = mushpipe("run", "own.yaml", "--manifest", "out.mcap", cwd=folder)
+    assert done.returncode == EXIT_USAGE
+    assert (folder / "out.mcap").read_bytes()[:5] == b"\x89MCAP"
 
 
 def test_two_sinks_never_write_one_file(folder: Path) -> None:
@@ -70,7 +97,7 @@ def test_a_sink_of_ones_own_is_kept_from_its_source_by_the_type_of_its_path(fold
     before = (folder / "a.mcap").read_bytes()
     done = mushpipe("run", "graph.yaml", "--source", "a.mcap", cwd=folder)
     assert done.returncode == EXIT_USAGE
-    assert "sink 'mine' would write over its own source" in done.stderr
+    assert "sink 'mine' would write over what the run reads" in done.stderr
     assert (folder / "a.mcap").read_bytes() == before
 
 

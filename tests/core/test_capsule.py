@@ -1,11 +1,12 @@
 """Failure capsules: written once per failing plugin, and run again to the same failure."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from mushpipe import Camera, Circles, RgbdFrame, Sink, Stage
+from mushpipe import Camera, Circles, RgbdFrame, Sink, SinkPath, Stage
 from mushpipe.core.capsule import capsule_document
 from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.graph import compile_document
@@ -136,6 +137,24 @@ def test_a_failing_sink_stays_in_its_capsule(lab: Lab, graph: str):
     first = lab.run(text, capsules=lab.folder)
     document = capsule_document(lab.folder / "failure-rich-out-0.mcap")
     assert document.data["sinks"] == {"out": {"use": "full"}}
+    assert str(again(lab, first.capsules[0]).error) == str(first.error)
+
+
+def test_the_sink_of_a_capsule_writes_beside_it(lab: Lab, graph: str):
+    class Full(Sink):
+        save: SinkPath
+
+        def consume(self, frame: RgbdFrame) -> None:
+            raise OSError("disk full")
+
+    lab.registry.sink("full", Full)
+    (lab.folder / "results").mkdir()
+    text = graph.replace("own-b", "fussy") + "\n"
+    text = text.replace("{out: {use: collect}}", "{out: {use: full, save: results/a.txt}}")
+    first = lab.run(text, capsules=lab.folder)
+    document = capsule_document(lab.folder / "failure-rich-out-0.mcap")
+    save = Path(document.data["sinks"]["out"]["save"])
+    assert save == lab.folder / "failure-rich-out-0.out" / "out" / "a.txt"
     assert str(again(lab, first.capsules[0]).error) == str(first.error)
 
 

@@ -164,6 +164,19 @@ def test_the_environment_narrows_the_packages(site, monkeypatch, wanted, found):
     assert "otsu" in names
 
 
+@pytest.mark.parametrize("wanted", ["my-plugin", "my_plugin", "My.Plugin"])
+def test_a_package_is_meant_however_its_name_is_written(site, monkeypatch, wanted):
+    install(site, "my_plugin", GOOD.replace('"nothing"', '"one"'))
+    monkeypatch.setenv("MUSHPIPE_PLUGINS", wanted)
+    assert "one" in load_registry().names("stage")
+
+
+def test_a_package_that_is_not_there_is_told_of(site, monkeypatch, caplog):
+    monkeypatch.setenv("MUSHPIPE_PLUGINS", "aaaa")
+    load_registry()
+    assert "MUSHPIPE_PLUGINS: no plugins are installed by aaaa" in caplog.text
+
+
 def test_two_plugins_of_one_name_must_be_told_apart(site, monkeypatch, capsys):
     install(site, "aaa", GOOD)
     install(site, "bbb", GOOD, version="3.4")

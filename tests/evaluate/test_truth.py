@@ -12,11 +12,14 @@ import pytest
 
 from mushpipe import Header
 from mushpipe.core.errors import InputError, UsageError
-from mushpipe.core.truth import Ignore
+from mushpipe.core.recorder import RecordingWriter
+from mushpipe.core.recording import MANIFEST
+from mushpipe.core.truth import TRUTH_TOPIC, Ignore
 from mushpipe.evaluate.judging import Rules, judge_results
 from mushpipe.evaluate.labels import convert
 from mushpipe.evaluate.results import Results, of_picks
 from mushpipe.evaluate.truth import FrameTruth, TruthSet, has_truth, read_truth
+from mushpipe.sources.mcap import McapSource
 from tests.evaluate.scenes import FRAME, bed, header, picks_of, write_recording, write_results
 
 FULL = {
@@ -239,3 +242,27 @@ def test_real_labels(name: str, frames: int, caps: int, ignored: int, may_find: 
     assert sum(len(part.caps) for part in parts) == caps
     assert sum(int((part.caps.ignore != 0).sum()) for part in parts) == ignored
     assert sum(len(part.may_find) for part in parts) == may_find
+
+
+def test_frames_whose_stamps_stand_still_keep_their_own_truth(tmp_path: Path) -> None:
+    moving = McapSource(path=Path(__file__).parents[2] / "recordings/moving.mcap")
+    frames, stamp_ns = list(moving.frames()), 1_700_000_000 * 10**9
+    writer = RecordingWriter(tmp_path / "still.mcap", {MANIFEST: {"json": "{}"}})
+    for frame in frames:
+        still = replace(frame.header, stamp_ns=stamp_ns)
+        for topic, message in frame.attached.items():
+            if topic == TRUTH_TOPIC:
+                said = json.loads(message.data) | {"timestamp": {"sec": 1_700_000_000, "nsec": 0}}
+                message = message._replace(data=json.dumps(said).encode())
+            writer.write(topic, message, still)
+        writer.frame(replace(frame, header=still, attached={}))
+    writer.close()
+    truth = read_truth(tmp_path / "still.mcap")
+    again = list(McapSource(path=tmp_path / "still.mcap").frames())
+    assert len(truth.frames) == len(again) == len(frames) > 2
+    for before, now in zip(frames, again, strict=True):
+        wanted = json.loads(before.attached[TRUTH_TOPIC].data)["center"]
+        assert json.loads(now.attached[TRUTH_TOPIC].data)["center"] == wanted
+        place = truth.place(now.header)
+        assert place is not None
+        np.testing.assert_allclose(truth.frames[place].caps.center, wanted)

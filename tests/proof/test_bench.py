@@ -60,7 +60,7 @@ def test_a_file_without_figures_is_no_baseline(tmp_path: Path, content: str) -> 
     path = tmp_path / "b.json"
     path.write_text(content)
     with pytest.raises(UsageError, match="no figures"):
-        read_baseline(path)
+        read_baseline(path, Path("graph.yaml"))
 
 
 def test_the_verb_plays_a_short_recording_over_and_over(
@@ -71,7 +71,10 @@ def test_the_verb_plays_a_short_recording_over_and_over(
     arguments += ["--set", f"view.save={tmp_path / 'view.rrd'}"]
     assert cli(monkeypatch, *arguments, "--json", tmp_path / "b.json") == 0
     assert "frames: 10\n" in capsys.readouterr().out
-    result = read_baseline(tmp_path / "b.json")
+    assert not (tmp_path / "log.mcap").exists()  # results of a run stay as they are
+    result = read_baseline(tmp_path / "b.json", Path("demo.yaml"))
+    with pytest.raises(UsageError, match=r"those of demo\.yaml, not of pick\.yaml"):
+        read_baseline(tmp_path / "b.json", Path("graphs/pick.yaml"))
     for times in (*result["nodes"].values(), result["frame"]):
         times["p50_ms"] /= 1000
     (tmp_path / "faster.json").write_text(json.dumps(result))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from mushpipe import InputError, Mask, Picks, Trace
 from mushpipe.core.errors import UsageError
-from mushpipe.proof.compare import compare
+from mushpipe.proof.compare import _difference, compare
 from tests.core.lab import cli
 from tests.io.values import SIZE, make_frame, make_picks, record, trace_of
 
@@ -161,3 +161,19 @@ def test_the_verb_says_what_differs_and_exits_with_3(
     assert capsys.readouterr().out.startswith("frame    12  /mushpipe/pick  position: 1 of 6")
     assert cli(monkeypatch, "compare", base, path, "--tol", "0.5") == 0
     assert capsys.readouterr().out == "13 messages on 5 topics: the same\n"
+
+
+def test_a_pixel_differs_however_many_of_its_channels_do() -> None:
+    a = np.zeros((100, 3), np.uint8)
+    b, c = a.copy(), a.copy()
+    b[[3, 7], 0] = 9
+    c[3] = 9
+    assert _difference(a, b, 0.01) == "2 of 100 pixels"
+    assert _difference(a, b, 0.02) is None
+    assert _difference(a, c, 0.0) == "1 of 100 pixels"
+
+
+@pytest.mark.parametrize("number", [2**53, 1_700_000_000_000_000_001])
+def test_large_integers_are_compared_exactly(number: int) -> None:
+    assert _difference([number], [number], 0.0) is None
+    assert _difference([number], [number + 1], 0.0) is not None

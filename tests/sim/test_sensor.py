@@ -140,3 +140,22 @@ def test_what_is_out_of_range_is_missing():
     settings = SceneSettings(scene="plane", width=160, height=120)
     still = Scene(settings, ColorCamera(), sensor).still(0.0)
     assert still.exact.lost.all()
+
+
+@pytest.mark.parametrize("fault", [{"edges": False}, {"random_holes": 0.0}])
+def test_switching_a_fault_off_leaves_the_noise_as_it_was(fault):
+    step = np.full((240, 320), 0.6, np.float32)
+    step[:, 160:] = 0.55
+    exact = Exact(step, np.zeros(step.shape, bool))
+    a, b = (DepthSensor(**drawn).sense(exact, 3, 5) for drawn in ({}, fault))
+    flat = np.abs(np.arange(320) - 160) > 20
+    both = ((a > 0) & (b > 0))[:, flat]
+    assert both.mean() > 0.95
+    assert (a[:, flat][both] == b[:, flat][both]).all()
+
+
+def test_what_no_unit_can_say_is_lost_and_a_range_has_two_ends():
+    far = Exact(np.full((24, 32), 0.8, np.float32), np.zeros((24, 32), bool))
+    assert (DepthSensor(**CLEAN, unit_mm=0.01).sense(far, 0, 0) == 0).all()
+    with pytest.raises(ValueError, match="nearest, farthest"):
+        DepthSensor(range_m=(1.5, 0.2))

@@ -29,6 +29,7 @@ from mushpipe.stages.nearest_depth import NearestDepth
 from mushpipe.stages.phase_hough import PhaseHough
 from mushpipe.stages.picks import MakePicks
 from mushpipe.stages.surface_fit import SurfaceFit
+from tests.stages.caps import cap, draw
 
 RECORDINGS = Path(__file__).parents[2] / "recordings"
 
@@ -151,3 +152,26 @@ def test_without_a_pose_there_is_no_tilt_to_speak_of() -> None:
 def test_a_range_of_heights_has_a_lower_and_an_upper_end() -> None:
     with pytest.raises(ValidationError, match="min_mm must be less than max_mm"):
         Height(min_mm=200, max_mm=150)
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        ("none", ()),
+        ("brown_conrady", (-0.2, 0.05, 0, 0, 0)),
+        ("brown_conrady", (0.1, 0, 0, 0, 0)),
+        ("inverse_brown_conrady", (0.13, 0.05, 0, 0, 0)),
+    ],
+)
+def test_a_diameter_is_that_behind_the_lens(lens: tuple[str, tuple[float, ...]]) -> None:
+    """25 degrees off the axis a lens may show a pixel a tenth larger or smaller."""
+    camera = Camera(640, 480, 500, 500, 319.5, 239.5, *lens)
+    one = cap(0, 0, (0.19, 0.12, 0.48), 0.022, 0.62)
+    depth, luma = draw([one], 0.5, camera)
+    v, u = np.nonzero(luma > 0.5)
+    radius = np.sqrt(len(u) / np.pi)
+    circles = Circles(np.array([[u.mean(), v.mean()]]), np.array([radius]), np.ones(1))
+    color = np.dstack([(255 * luma).astype(np.uint8)] * 3)
+    frame = RgbdFrame(Header(1, 0, "camera"), color, depth.astype(np.float32), 1.0, camera)
+    found = SurfaceFit().process(frame, circles)
+    assert 1000 * found.diameter[0] == pytest.approx(44, abs=1.2)
