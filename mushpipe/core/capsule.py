@@ -30,7 +30,7 @@ def write_capsule(folder: Path, plan: Plan, node: Node, frame: RgbdFrame, messag
     path = folder / f"failure-{name}-{node.name}-{number}.mcap"
     sinks = tuple(sink for sink in plan.sinks if sink.name == node.name)
     kept = replace(plan, sinks=sinks, on_error="fail")  # one frame: skipping it would show nothing
-    kept = kept.into(path.with_suffix(".out"))
+    kept = kept.into(path.absolute().with_suffix(".out"))
     metadata = {GRAPH: {"json": json.dumps(kept.resolved()), "failure": message}}
     writer = RecordingWriter(path, metadata)
     writer.frame(frame)

@@ -33,6 +33,7 @@ KIND = "mushpipe cap-net 1"  # what the model's own metadata call it
 _BLOCK = 32  # px; the coarsest stride
 # px; radii that the training showed. A range beyond them is brought there by scaling the image.
 _KNOWN = (7.0, 60.0)
+_LARGEST_SCALE = 4.0
 
 
 class CapNet(Stage):
@@ -59,6 +60,8 @@ class CapNet(Stage):
     def _ordered(self) -> Self:
         if self.radius_px[0] >= self.radius_px[1]:
             raise ValueError("radius_px must be [smallest, largest]")
+        if self.scale() > _LARGEST_SCALE:
+            raise ValueError("radius_px lies below what an image shows of a cap; is it in px?")
         return self
 
     def open(self) -> None:

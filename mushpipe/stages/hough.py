@@ -71,7 +71,7 @@ class Hough(_Peer):
             param1=self.edge,
             param2=self.perfectness if alt else self.votes,
             minRadius=max(1, round(self.radius_px[0])),
-            maxRadius=max(1, round(self.radius_px[1])),
+            maxRadius=max(1, min(round(self.radius_px[1]), max(gray.shape))),
         )
         circles = np.zeros((0, 3)) if found is None else np.asarray(found[0, :, :3], np.float64)
         return circles[circles[:, 2] > 0]

@@ -151,7 +151,8 @@ def _moved(old: Sightings, new: Sightings, image: tuple[int, int]) -> tuple[Sigh
 def _common_shift(new: Sightings, old: Sightings) -> Floats:
     """Return the shift (2,) px that most pairs of old and new circles agree on, by voting."""
     steps = (new.center[:, None] - old.center[None]).reshape(-1, 2)
-    cells = np.rint(steps / (GATE / 2 * float(np.median(new.radius)))).astype(int)
+    cell = max(GATE / 2 * float(np.median(new.radius)), 2.0)  # px; finer, it would take minutes
+    cells = np.rint(steps / cell).astype(int)
     cells -= cells.min(axis=0) - 1  # with a margin, because a peak may lie between cells
     shape = cells.max(axis=0) + 2
     votes = np.bincount(np.ravel_multi_index(tuple(cells.T), shape), minlength=shape.prod())

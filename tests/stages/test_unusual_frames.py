@@ -23,6 +23,7 @@ from mushpipe import (
 from mushpipe.sources.mcap import McapSource
 from mushpipe.sources.synthetic import SyntheticSource
 from mushpipe.stages.cap_fit import CapFit
+from mushpipe.stages.cap_net import CapNet
 from mushpipe.stages.chan_vese import ChanVese
 from mushpipe.stages.height import Height
 from mushpipe.stages.nearest_depth import NearestDepth
@@ -147,6 +148,12 @@ def test_without_a_pose_there_is_no_tilt_to_speak_of() -> None:
     picks = MakePicks().process(frame, circles, Locations.unknown(1), Poses.unknown(1))
     assert picks.flags[0] & PickFlag.POSE_UNKNOWN
     assert not picks.flags[0] & PickFlag.TILT_UNOBSERVABLE
+
+
+def test_a_range_of_radii_that_no_image_shows_is_refused() -> None:
+    with pytest.raises(ValidationError, match="is it in px"):
+        CapNet(radius_px=(0.02, 0.06))
+    assert CapNet(radius_px=(2, 10)).scale() == 3.5
 
 
 def test_a_range_of_heights_has_a_lower_and_an_upper_end() -> None:
