@@ -55,7 +55,7 @@ def files_read(plan: Plan) -> tuple[Path, ...]:
     """
     nodes = (plan.source, *plan.stages, *plan.sinks)
     code = (node.use.rpartition(":")[0] for node in nodes if ".py:" in node.use)
-    given = (path for node in nodes for path in node.plugin.given_files())
+    given = (path for node in nodes for path in node.plugin.path_settings(written=False).values())
     graph = Path(plan.file)
     return (graph, *(graph.parent / file for file in code), *given, *files_of(plan.source))
 

@@ -94,11 +94,11 @@ class Plugin(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    def given_files(self) -> tuple[Path, ...]:
-        """Return the files that its settings name to be read, such as a model."""
-        settings = type(self).model_fields.items()
-        values = (getattr(self, name) for name, setting in settings if not _is_written(setting))
-        return tuple(value for value in values if isinstance(value, Path))
+    def path_settings(self, written: bool) -> dict[str, Path]:
+        """Return the settings that name files: of type `SinkPath`, or to be read as a model is."""
+        settings, kinds = type(self).model_fields.items(), Path | str if written else Path
+        named = ((n, getattr(self, n)) for n, f in settings if _is_written(f) is written)
+        return {n: Path(v) for n, v in named if isinstance(v, kinds) and Path(v) != STDIO}
 
     def close(self) -> None:
         """Release what `open` took; also called after a failure, and after a failed `open`."""
@@ -185,14 +185,11 @@ class Sink(Plugin):
 
     def files(self, run: RunInfo) -> tuple[Path, ...]:
         """Return the files it writes; if not overridden, those of settings of type `SinkPath`."""
-        paths = (getattr(self, n) for n, f in type(self).model_fields.items() if _is_written(f))
-        return tuple(run.path(path) for path in paths if path not in (None, STDIO))
+        return tuple(map(run.path, self.path_settings(written=True).values()))
 
     def into(self, folder: Path) -> Self:
         """Return a copy that writes the files of its settings of type `SinkPath` into a folder."""
-        names = (name for name, setting in type(self).model_fields.items() if _is_written(setting))
-        paths = {name: getattr(self, name) for name in names}
-        moved = {n: folder / path.name for n, path in paths.items() if path not in (None, STDIO)}
+        moved = {n: folder / path.name for n, path in self.path_settings(written=True).items()}
         return self.model_copy(update=moved)
 
     def finish(self, summary: Mapping[str, Any]) -> None:
