@@ -196,9 +196,11 @@ def schema(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="file to write")] = None,
 ) -> None:
     """Print the JSON Schema of graph files, for completion in an editor."""
+    from mushpipe.core.overwriting import require_writable
     from mushpipe.core.plugins import load_registry
     from mushpipe.core.schema import graph_schema
 
+    require_writable(out)
     text = json.dumps(graph_schema(load_registry()), indent=2)
     _out(text) if out is None else out.write_text(text + "\n")
 

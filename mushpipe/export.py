@@ -38,7 +38,7 @@ def read_picks(path: Path, topic: str | None = None) -> Iterator[tuple[Header, P
 
     Raises:
         InputError: It holds no picks or, after the last good frame, is damaged.
-        UsageError: Several topics hold picks and none is named.
+        UsageError: The topic holds none, or several topics do and none is named.
     """
     reader = RecordingReader(path)
     index = reader.index()
@@ -47,9 +47,10 @@ def read_picks(path: Path, topic: str | None = None) -> Iterator[tuple[Header, P
         raise UsageError(
             f"{path}: several topics hold picks: choose with --topic {' or --topic '.join(topics)}"
         )
-    if topic not in (None, *topics) or not topics:
-        held = f"it holds {', '.join(topics)}" if topics else reader.contents()
-        raise InputError(f"{path}: no picks on {topic or 'any topic'} ({held})")
+    if not topics:
+        raise InputError(f"{path}: no picks on any topic ({reader.contents()})")
+    if topic not in (None, *topics):
+        raise UsageError(f"{path}: no picks on {topic}; they are on {', '.join(topics)}")
     for raw in reader.messages({topic or topics[0]}):
         try:
             decoded = decode_table(_SCHEMA, raw.message.data, raw.message.log_time)

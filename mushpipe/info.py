@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from mushpipe.core.errors import PluginError, suggest
-from mushpipe.core.plugins import Registry
+from mushpipe.core.plugins import Registry, class_in_file, in_file
 from mushpipe.core.recording import MANIFEST, RecordingReader
-from mushpipe.core.stage import Kind, Plugin, ports_of
+from mushpipe.core.stage import Kind, Plugin, kind_of, ports_of
 
 KINDS: tuple[Kind, ...] = ("source", "stage", "sink")
 
@@ -98,26 +98,18 @@ def describe_plugin(registry: Registry, name: str) -> str:
     Raises:
         PluginError: There is none.
     """
-    if ".py:" in name:
-        classes = [(kind, _try(registry, kind, name)) for kind in KINDS]
+    if in_file(name):
+        plugin = class_in_file(name, Path.cwd())
+        classes = [(kind_of(plugin), plugin)]
     else:
         bare = name.rpartition(":")[2]
         kinds = [kind for kind in KINDS if (kind, bare) in registry.entries]
         classes = [(kind, registry.find(kind, name, Path.cwd())) for kind in kinds]
-    found = [_describe_class(kind, name, plugin) for kind, plugin in classes if plugin]
+    found = [_describe_class(kind, name, plugin) for kind, plugin in classes]
     if not found:
         known = sorted({n for kind in KINDS for n in registry.names(kind)})
         raise PluginError(f"there is no plugin '{name}'; {suggest(name, known)}")
     return "\n\n".join(found)
-
-
-def _try(registry: Registry, kind: Kind, name: str) -> type[Plugin] | None:
-    try:
-        return registry.find(kind, name, Path.cwd())
-    except PluginError as error:
-        if "not a" in str(error):
-            return None
-        raise
 
 
 def _describe_class(kind: Kind, name: str, plugin: type[Plugin]) -> str:

@@ -41,12 +41,13 @@ def source_recording(results: Path, manifest: Mapping[str, Any]) -> Path | None:
     source = Path(str(manifest.get("graph", {}).get("source", {}).get("path", "")))
     stated = (manifest.get("recordings") or [{}])[0]
     for path in (source, results.parent / source, results.parent / source.name):
-        if path.is_file() and _sha256(path) == stated.get("sha256"):
+        if path.is_file() and sha256(path) == stated.get("sha256"):
             return path
     return None
 
 
-def _sha256(path: Path) -> str:
+def sha256(path: Path) -> str:
+    """Return the SHA-256 of a file, in hexadecimal digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

@@ -68,8 +68,10 @@ def view(
     ] = None,
 ) -> None:
     """Open a recording or results in the Rerun viewer."""
+    from pydantic import ValidationError
+
     from mushpipe.console import interruptible, set_up_logging
-    from mushpipe.core.errors import DependencyError
+    from mushpipe.core.errors import DependencyError, UsageError
     from mushpipe.core.overwriting import spare
     from mushpipe.sinks.rerun import RerunSink, has_display
 
@@ -82,9 +84,13 @@ def view(
             f"command 'rerun' elsewhere; --serve 9876 lets viewers fetch it from this machine "
             "(through ssh -L 9876:localhost:9876, say: rerun rerun+http://127.0.0.1:9876/proxy)"
         )
+    try:
+        sink = RerunSink(save=save, spawn=spawn, serve=serve)
+    except ValidationError as error:
+        reason = error.errors()[0]["msg"].removeprefix("Value error, ")
+        raise UsageError(f"--save {save}: {reason}") from error
     stop = threading.Event()
     with interruptible(stop):
-        sink = RerunSink(save=save, spawn=spawn, serve=serve)
         _play(file, sink, stop)
         if serve is not None:
             stop.wait()

@@ -108,6 +108,8 @@ def parse_value(text: str, label: str) -> Any:
     Raises:
         GraphError: It is YAML, but not plain data; the label says where it comes from.
     """
+    if text == "-":  # a list of nothing in YAML; who types it means standard output
+        return text
     try:
         root = yaml.compose(text, Loader=_Loader)
     except _UNREADABLE:

@@ -6,16 +6,16 @@ import json
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mushpipe.core.document import Document, Location
 from mushpipe.core.errors import GraphError, PluginError, Problem, suggest
-from mushpipe.core.overrides import apply_override
+from mushpipe.core.overrides import apply_override, not_utf8
 from mushpipe.core.plan import Node, Plan
 from mushpipe.core.plugins import Registry
-from mushpipe.core.stage import WORDS, Kind, Plugin, ports_of, settings_of
+from mushpipe.core.stage import WORDS, Kind, Plugin, Source, ports_of, settings_of
 from mushpipe.core.wire import RESULT_PREFIX, TIMING_TOPIC
 from mushpipe.core.wiring import wire
 
@@ -60,6 +60,8 @@ def compile_document(
     """
     problems: list[Problem] = []
     if source is not None:
+        if (foreign := not_utf8(source)) is not None:
+            raise GraphError([Problem(f"--source {source}", 0, 0, foreign)])
         _replace_source(document, source, registry)
     for item in overrides:
         text, label = (item, "") if isinstance(item, str) else item
@@ -73,6 +75,8 @@ def compile_document(
     complete = [node for group in nodes.values() for node in group if node is not None]
     if nodes["source"] and len(complete) == sum(map(len, nodes.values())):
         problems += wire(document, registry, complete)
+    if not problems:
+        problems += _check_files(document, complete)
     if problems or head is None:
         raise GraphError(problems)
     return Plan(
@@ -83,7 +87,7 @@ def compile_document(
         seed=head.seed,
         on_error=head.on_error,
         max_failures=head.max_failures,
-        overrides=tuple(document.overrides.values()),
+        overrides=tuple(dict.fromkeys(document.overrides.values())),
         warnings=tuple(document.warnings),
     )
 
@@ -92,7 +96,7 @@ def _head(document: Document, problems: list[Problem]) -> GraphFile | None:
     try:
         return GraphFile.model_validate_json(json.dumps(document.data), strict=True)
     except ValidationError as error:
-        problems += _translate(document, (), error, list(GraphFile.model_fields))
+        problems += _translate(document, (), error, GraphFile)
         return None
 
 
@@ -121,6 +125,9 @@ def _replace_source(document: Document, source: str, registry: Registry) -> None
         given = {"use": source}
     elif source.endswith(".bag"):
         given = {"use": "realsense", "file": source}
+    elif not (Path(source).exists() or Path(source).suffix):
+        hint = suggest(source, registry.names("source"))
+        document.warnings.append(f"'{source}' is neither a file nor a source; {hint}")
     old = document.data.get("source")
     if isinstance(old, dict) and old.get("use") == given["use"]:
         given = {**old, **given}
@@ -155,6 +162,17 @@ def _check_names(
     return problems
 
 
+def _check_files(document: Document, nodes: list[Node]) -> list[Problem]:
+    """Return which sinks would write the same file; other ways to one are found by a run."""
+    problems, taken = [], dict[Path, str]()
+    for node in nodes:
+        for setting, path in node.plugin.path_settings(written=True).items():
+            if (other := taken.setdefault(path, node.name)) != node.name:
+                message = f"sink '{node.name}' would write over the file of sink '{other}', {path}"
+                problems.append(document.problem(("sinks", node.name, setting), message))
+    return problems
+
+
 def _node(
     document: Document,
     registry: Registry,
@@ -170,19 +188,18 @@ def _node(
         return None
     if not isinstance(inputs, dict) or not all(isinstance(v, str) for v in inputs.values()):
         problems.append(document.problem((*at, "inputs"), "expected {parameter: stage name}"))
-        return None
+        inputs = {}
     if delivery not in ((None, "every", "latest") if kind == "sink" else (None,)):
-        problems.append(
-            document.problem((*at, "delivery"), "expected 'every' or 'latest', on a sink")
-        )
-        return None
+        message = "expected 'every' or 'latest', on a sink"
+        problems.append(document.problem((*at, "delivery"), message))
     base = Path.cwd() if (*at, "use") in document.overrides else document.base
     try:
         plugin_class = registry.find(kind, use, base)
         ports = ports_of(plugin_class)
     except PluginError as error:
         problems.append(document.problem((*at, "use"), str(error)))
-        return None
+        # every source gives the same: what is below it can be looked at without
+        return Node("source", kind, use, Source(), ports_of(Source)) if kind == "source" else None
     if (*at, "use") in document.overrides:
         settings = _drop_foreign(document, at, use, plugin_class, settings)
         inputs = {k: v for k, v in inputs.items() if k in {port.name for port in ports.inputs}}
@@ -193,7 +210,7 @@ def _node(
             context={"base": document.base.absolute(), "from_shell": document.from_shell(at)},
         )
     except ValidationError as error:
-        problems += _translate(document, at, error, list(settings_of(plugin_class)), use)
+        problems += _translate(document, at, error, plugin_class, use)
         # never run, but its ports say whether it is wired
         unset = plugin_class.model_construct()
         return Node(str(at[-1]), kind, use, unset, ports, dict(inputs), delivery)
@@ -219,7 +236,7 @@ def _drop_foreign(
 
 
 def _translate(
-    document: Document, at: Location, error: ValidationError, known: list[str], use: str = ""
+    document: Document, at: Location, error: ValidationError, model: type[BaseModel], use: str = ""
 ) -> list[Problem]:
     """Turn pydantic's errors into problems with places and suggestions."""
     problems = []
@@ -232,8 +249,8 @@ def _translate(
         name = str(loc[-1]) if loc else ""
         if unknown:
             what = f"unknown setting '{name}'{of}"
-            top = len(loc) == 1
-            problems.append(document.problem(path, what, suggest(name, known) if top else "", True))
+            hint = suggest(name, known) if (known := _known(model, loc[:-1])) else ""
+            problems.append(document.problem(path, what, hint, True))
         elif item["type"] == "missing":
             text = f"setting '{place}'{of} is missing"
             if isinstance(last := path[-1], int):  # of a list
@@ -248,3 +265,15 @@ def _translate(
                 given = f" (with {', '.join(labels)})" if labels else ""
             problems.append(document.problem(path, f"{what}: {message}{given}"))
     return problems
+
+
+def _known(model: type[BaseModel], place: Location) -> list[str]:
+    """Return the names of the settings at a place in a model, none where it is no group."""
+    for part in place:
+        field = model.model_fields.get(settings_of(model).get(str(part), ""))
+        kinds = (field.annotation, *get_args(field.annotation)) if field else ()
+        groups = [k for k in kinds if isinstance(k, type) and issubclass(k, BaseModel)]
+        if len(groups) != 1:
+            return []
+        model = groups[0]
+    return list(settings_of(model))

@@ -18,6 +18,8 @@ def apply_override(document: Document, text: str, label: str = "") -> list[Probl
     messages where the change comes from.
     """
     label = label or f"--set {text}"
+    if (foreign := not_utf8(text)) is not None:
+        return [Problem(label, 0, 0, foreign)]
     path, equals, value_text = text.partition("=")
     if not equals:
         return [Problem(label, 0, 0, "expected a.b=value")]
@@ -39,6 +41,15 @@ def apply_override(document: Document, text: str, label: str = "") -> list[Probl
             del marks[place]
     document.overrides[at] = label
     return []
+
+
+def not_utf8(text: str) -> str | None:
+    """Say that a text of the command line is not UTF-8, as graphs and recordings are."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return "this is not UTF-8: give the file another name"
+    return None
 
 
 def _locate(document: Document, path: str) -> tuple[Location, str]:

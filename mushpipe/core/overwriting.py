@@ -37,6 +37,18 @@ def require_writable(out: Path | None) -> None:
         raise UsageError(f"{out} cannot be written: {fault}")
 
 
+def make_folder(folder: Path) -> None:
+    """Make a folder for what will be written, where there is none yet.
+
+    Raises:
+        UsageError: There can be none.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{folder} cannot be a folder: {error.strerror}") from error
+
+
 def spare_files(read: Iterable[Path], written: Mapping[str, Iterable[Path]]) -> None:
     """Refuse what sinks could not write, or not without harm, before any of them opens.
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from mushpipe.core.stage import STDIO, Kind, Plugin, Ports, Sink, Source
+from mushpipe.core.stage import Kind, Plugin, Ports, Sink, Source
 
 
 class Link(NamedTuple):
@@ -105,8 +105,8 @@ class Plan:
         return [
             f"{node.name}: there is no file {value} ({name})"
             for node in (self.source, *self.stages)
-            for name, value in node.plugin
-            if isinstance(value, Path) and value != STDIO and not value.exists()
+            for name, value in node.plugin.path_settings(written=False).items()
+            if not value.exists()
         ]
 
     def delivery(self, sink: Node) -> Literal["every", "latest"]:

@@ -116,8 +116,11 @@ class Registry:
         Raises:
             PluginError: Unknown, ambiguous, broken or of the wrong kind.
         """
-        if ".py:" in use:
-            return _from_file(kind, use, base)
+        if in_file(use):
+            plugin = class_in_file(use, base)
+            if kind_of(plugin) != kind:
+                raise PluginError(f"{use} is a {kind_of(plugin)}, not a {kind}")
+            return plugin
         distribution, _, name = use.rpartition(":")
         found = [
             entry
@@ -209,18 +212,33 @@ def _import(target: str) -> Any:
     return getattr(importlib.import_module(module), name)
 
 
-def _from_file(kind: Kind, use: str, base: Path) -> type[Plugin]:
-    path_text, _, name = use.rpartition(":")
+def in_file(use: str) -> bool:
+    """Whether a text names a plugin by its file."""
+    return ".py:" in use or use.endswith(".py")
+
+
+def class_in_file(use: str, base: Path) -> type[Plugin]:
+    """Return the class that ``path/to/file.py:Class`` names.
+
+    Raises:
+        PluginError: There is no such file or class, or it cannot be imported.
+    """
+    path_text, _, name = use.rpartition(":") if ".py:" in use else (use, "", "")
     path = (base / path_text).resolve()
     module = _module_of_file(path)
+    if not name:
+        known = ", ".join(_classes(module)) or "none"
+        raise PluginError(f"'{use}' says no class: write '{path_text}:CLASS'; it has {known}")
     plugin = getattr(module, name, None)
     if plugin is None:
-        values = vars(module).items()
-        known = [n for n, v in values if isinstance(v, type) and v.__module__ == module.__name__]
-        raise PluginError(f"{path} has no class '{name}'; {suggest(name, known)}")
-    if kind_of(plugin) != kind:
-        raise PluginError(f"{use} is a {kind_of(plugin)}, not a {kind}")
+        raise PluginError(f"{path} has no class '{name}'; {suggest(name, _classes(module))}")
     return plugin  # type: ignore[no-any-return]
+
+
+def _classes(module: ModuleType) -> list[str]:
+    """Return the names of the classes that a module defines itself."""
+    values = vars(module).items()
+    return [n for n, v in values if isinstance(v, type) and v.__module__ == module.__name__]
 
 
 def _module_of_file(path: Path) -> ModuleType:

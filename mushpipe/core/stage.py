@@ -227,9 +227,9 @@ def kind_of(plugin: type) -> Kind:
     raise PluginError(f"{plugin!r} is not a Stage, Source or Sink class")
 
 
-def settings_of(plugin: type[Plugin]) -> dict[str, str]:
-    """Return the settings' names in a graph file, each with its attribute of the plugin."""
-    return {field.alias or name: name for name, field in plugin.model_fields.items()}
+def settings_of(model: type[BaseModel]) -> dict[str, str]:
+    """Return the settings' names in a graph file, each with its attribute of the model."""
+    return {field.alias or name: name for name, field in model.model_fields.items()}
 
 
 def ports_of(plugin: type[Plugin]) -> Ports:

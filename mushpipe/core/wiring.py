@@ -25,6 +25,10 @@ def wire(document: Document, registry: Registry, nodes: list[Node]) -> list[Prob
             problems.append(document.problem(at, f"'{node.use}' has no input '{name}'", hint, True))
         for port in node.ports.inputs:
             if port.type is Trace and node.kind == "sink":
+                if port.name in node.asked:
+                    at = (*_place(node), "inputs", port.name)
+                    message = f"'{port.name}' of '{node.use}' is everything that all stages found"
+                    problems.append(document.problem(at, message, "leave it out", key=True))
                 continue
             problem = _connect(document, registry, node, port, above, nodes)
             problems += [problem] if problem else []

@@ -144,10 +144,11 @@ def _require_none(**options: object) -> None:
 
 
 def _judge(request: Request, out: Path | None, report: Path | None, output: Output) -> int:
+    from mushpipe.core.overwriting import make_folder
     from mushpipe.evaluate.command import perform
 
     for folder in filter(None, (out, report)):  # before the work that goes into them
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
     # Frames for the page may stand in the temporary results, so those live until it is written.
     with tempfile.TemporaryDirectory(prefix="mushpipe-eval-") as temporary:
         judgement = perform(request, out or Path(temporary), _run)

@@ -11,7 +11,7 @@ from mushpipe.evaluate.events import UP, Events, Verdict, comparable, events_of,
 from mushpipe.evaluate.metrics import Value, measure
 from mushpipe.evaluate.results import Results, none_found
 from mushpipe.evaluate.truth import Place, TruthSet, has_truth, read_truth
-from mushpipe.traces import source_recording
+from mushpipe.traces import sha256, source_recording
 
 OPTICAL = "the camera's optical frame"  # of labels that name none
 
@@ -135,6 +135,8 @@ def judge_results(
             if known.frame_id is None and detections.frame_id in results.robot_frames:
                 known = replace(known, frame_id=OPTICAL)
             judged.verdicts.append(judge(judged.name, place, known, header, detections, rules.iou))
+    if foreign := _foreign(results, truth):
+        judged.notes.append(foreign)
     if len(judged.verdicts) < len(results.frames):
         unknown = len(results.frames) - len(judged.verdicts)
         judged.notes.append(f"{unknown} frames have no truth and are not judged")
@@ -148,6 +150,17 @@ def judge_results(
         judged.verdicts.append(judge(judged.name, place, known, None, none_found(), rules.iou))
     judged.verdicts.sort(key=lambda verdict: verdict.place)
     return judged
+
+
+def _foreign(results: Results, truth: TruthSet) -> str:
+    """Say that the truth is carried by another recording than the one that was played."""
+    stated = results.manifest.get("recordings") or []
+    played = {entry["sha256"]: entry["file"] for entry in stated if entry.get("sha256")}
+    if not played or truth.recording in (None, results.path):
+        return ""
+    if sha256(truth.recording) in played:
+        return ""
+    return f"the truth is that of {truth.name}; what was played is {', '.join(played.values())}"
 
 
 def _unanswered(judged: Judged) -> list[Place]:

@@ -11,7 +11,7 @@ import numpy as np
 import orjson
 from pydantic import ValidationError
 
-from mushpipe.core.errors import InputError
+from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.recording import RecordingReader
 from mushpipe.core.tables import Floats
 from mushpipe.core.truth import TRUTH_TOPIC, Truth
@@ -47,11 +47,13 @@ class TruthSet:
         name: Where it comes from.
         frames: The truth of each frame.
         damage: What could not be read, in words.
+        recording: The recording that carries it; None for a file of labels.
     """
 
     name: str
     frames: Mapping[Place, FrameTruth]
     damage: tuple[str, ...] = ()
+    recording: Path | None = None
 
     @property
     def numbered(self) -> bool:
@@ -68,6 +70,7 @@ def read_truth(path: Path) -> TruthSet:
     """Read the truth from a recording (``.mcap``) or from labels (any other file).
 
     Raises:
+        UsageError: There is no such file.
         InputError: The file cannot be read, holds no truth, or is wrong.
     """
     return truth_of_recording(path) if path.suffix == ".mcap" else truth_of_labels(path)
@@ -102,14 +105,15 @@ def truth_of_recording(path: Path) -> TruthSet:
     frames = {("stamp_ns", header.stamp_ns): truth for header, truth in found}
     if len(frames) < len(found):  # stamps stood still
         frames = {("index", header.sequence): truth for header, truth in found}
-    return TruthSet(path.name, frames, tuple(reader.damage))
+    return TruthSet(path.name, frames, tuple(reader.damage), path)
 
 
 def truth_of_labels(path: Path) -> TruthSet:
     """Read a file of labels in the project's format or a foreign one; see `labels`.
 
     Raises:
-        InputError: It is missing, no JSON, or no such labels.
+        UsageError: There is no such file.
+        InputError: It is no JSON, or no such labels.
     """
     try:
         document = orjson.loads(path.read_bytes())
@@ -117,7 +121,7 @@ def truth_of_labels(path: Path) -> TruthSet:
             raise ValueError("expected a JSON object")
         labels = parse_labels(document)
     except FileNotFoundError:
-        raise InputError(f"{path}: there are no such labels") from None
+        raise UsageError(f"{path}: there are no such labels") from None
     except ValidationError as error:
         faults = [f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()]
         raise InputError("\n  ".join([f"{path}: not valid labels:", *faults[:20]])) from error

@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
-from functools import cache
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import orjson
+from mcap_protobuf.decoder import DecoderFactory
 
 from mushpipe.core import wire
 from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.recording import Raw, RecordingReader
 
 Fields = Mapping[str, Any]
-_IMAGE = "foxglove.RawImage"
+_IMAGE, _COMPRESSED = "foxglove.RawImage", "foxglove.CompressedImage"
 _PIXELS = {"mono8": "u1", "rgb8": "u1", "mono16": "<u2", "16UC1": "<u2", "32FC1": "<f4"}
+
+# One for each schema: they know it by its id, which differs between recordings.
+_DECODERS: dict[tuple[str, bytes], DecoderFactory] = defaultdict(DecoderFactory)
 
 
 class Key(NamedTuple):
@@ -132,27 +135,40 @@ def _content(raw: Raw) -> dict[str, Any]:
     message = _decoded(raw)
     if message is None:
         return {"bytes": [data]}
-    if raw.schema is not None and raw.schema.name == _IMAGE and message.encoding in _PIXELS:
+    name = raw.schema.name if raw.schema else ""
+    if name == _IMAGE and message.encoding in _PIXELS:
         pixels = np.frombuffer(message.data, _PIXELS[message.encoding])
-        if area := message.width * message.height:
-            pixels = pixels.reshape(area, -1) if len(pixels) % area == 0 else pixels
-        size = [message.width, message.height, message.encoding]
-        return {"size": size, "frame_id": [message.frame_id], "pixels": pixels}
+        return _image(pixels, message.width, message.height, message.encoding, message.frame_id)
+    if name == _COMPRESSED and (decoded := _decompressed(message.data)) is not None:
+        height, width = decoded.shape[:2]
+        return _image(decoded.ravel(), width, height, message.format, message.frame_id)
     from google.protobuf.json_format import MessageToDict
 
     # A field that is zero stands in no protobuf message.
     return _by_path(MessageToDict(message, always_print_fields_with_no_presence=True))
 
 
-@cache
-def _protobuf() -> Any:
-    from mcap_protobuf.decoder import DecoderFactory
+def _image(
+    values: np.ndarray[Any, Any], width: int, height: int, encoding: str, frame_id: str
+) -> dict[str, Any]:
+    area = width * height
+    pixels = values.reshape(area, -1) if area and len(values) % area == 0 else values
+    return {"size": [width, height, encoding], "frame_id": [frame_id], "pixels": pixels}
 
-    return DecoderFactory()
+
+def _decompressed(data: bytes) -> np.ndarray[Any, Any] | None:
+    """Return the pixels of a JPEG or PNG; None where it cannot be read."""
+    import cv2
+
+    encoded = np.frombuffer(data, np.uint8)
+    return cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED) if len(encoded) else None
 
 
 def _decoded(raw: Raw) -> Any:
-    decode = _protobuf().decoder_for(raw.channel.message_encoding, raw.schema)
+    if raw.schema is None:
+        return None
+    decoders = _DECODERS[raw.schema.name, raw.schema.data]
+    decode = decoders.decoder_for(raw.channel.message_encoding, raw.schema)
     return decode(raw.message.data) if decode else None
 
 

@@ -58,7 +58,13 @@ class Definition:
 
 
 def definitions(table: Path = TABLE) -> dict[str, Definition]:
-    """Read the table: name -> definition, in the table's order."""
+    """Read the table: name -> definition, in the table's order.
+
+    Raises:
+        UsageError: There is no such file.
+    """
+    if not table.is_file():
+        raise UsageError(f"there is no {table} here: run this in the project's folder")
     rows = yaml.safe_load(table.read_text())
     return {name: Definition(name, row["purpose"], row["settings"]) for name, row in rows.items()}
 

@@ -12,6 +12,7 @@ from mcap.reader import make_reader
 
 from mushpipe.core.errors import EXIT_DAMAGED, EXIT_FAILED, EXIT_USAGE
 from mushpipe.core.recording import RecordingReader
+from tests.io.values import make_frame, make_picks, record, trace_of
 
 ROOT = Path(__file__).parents[2]
 PICK_KEYS = [
@@ -157,12 +158,39 @@ def test_faults_of_a_graph_are_printed_together_with_places(folder: Path) -> Non
             EXIT_USAGE,
             "error: there is no plugin 'otsi'; did you mean 'otsu'?\n",
         ),
+        (
+            ["plugins", "describe", "broken.py:Mine"],
+            EXIT_USAGE,
+            "broken.py cannot be imported: TypeError: 'int' object is not a mapping\n",
+        ),
+        (
+            ["export", "results.mcap", "--topic", "/picks"],
+            EXIT_USAGE,
+            "error: results.mcap: no picks on /picks; they are on /mushpipe/pick\n",
+        ),
+        (
+            ["eval", "results.mcap", "--truth", "nope.json"],
+            EXIT_USAGE,
+            "error: nope.json: there are no such labels\n",
+        ),
+        (
+            ["eval", "graph.yaml", "--out", "empty.mcap"],
+            EXIT_USAGE,
+            "error: empty.mcap cannot be a folder: File exists\n",
+        ),
+        (
+            ["view", "results.mcap", "--save", "a{b}.rrd"],
+            EXIT_USAGE,
+            "error: --save a{b}.rrd: {b} is not known: only {recording} is\n",
+        ),
     ],
 )
 def test_errors_name_what_is_wrong(
     folder: Path, arguments: list[str], code: int, message: str
 ) -> None:
     (folder / "empty.mcap").touch()
+    (folder / "broken.py").write_text("{**5}\n")
+    record(folder / "results.mcap", [trace_of(make_frame(), pick=make_picks())])
     done = mushpipe(*arguments, cwd=folder)
     assert message in done.stderr
     assert done.returncode == code

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from mushpipe.core.errors import EXIT_FAILED, EXIT_USAGE
+from mushpipe.core.errors import EXIT_USAGE
 from tests.cli.test_commands import GRAPH, mushpipe
 
 
@@ -126,6 +126,7 @@ def test_results_are_kept_where_another_sink_cannot_open(
         ("bench", "graph.yaml", "--json", "none/a.json"),
         ("calibrate", "depth", "a.mcap", "--plane", "0.5", "-o", "none/a.json"),
         ("figure", "a.mcap", "-o", "none/a.json"),
+        ("schema", "-o", "none/a.json"),
     ],
 )
 def test_where_nothing_can_be_written_no_work_begins(
@@ -139,6 +140,6 @@ def test_where_nothing_can_be_written_no_work_begins(
 
 def test_a_file_that_cannot_be_written_is_named(folder: Path) -> None:
     done = mushpipe("schema", "-o", "/proc/nowhere/schema.json", cwd=folder)
-    assert done.returncode == EXIT_FAILED
+    assert done.returncode == EXIT_USAGE
     assert done.stderr.startswith("error: /proc/nowhere")
     assert "Traceback" not in done.stderr

@@ -245,6 +245,49 @@ def test_a_faulty_setting_does_not_hide_that_an_input_is_missing(lab: Lab):
     assert "5:35: there is no stage 'aa'; did you mean 'a'?" in text
 
 
+def test_a_wrong_word_beside_the_settings_hides_none_of_their_faults(lab: Lab):
+    text = lab.faults("""
+        mushpipe: 1
+        source: {use: frames}
+        stages:
+          a: {use: threshold, inputs: 3, level: x}
+        sinks:
+          out: {use: collect, delivery: often, size: -1}
+    """)
+    places = [line.split(": ")[0] for line in text.splitlines() if line.startswith("graph.yaml")]
+    assert places == [f"graph.yaml:{place}" for place in ["4:31", "4:41", "6:33", "6:46"]]
+
+
+def test_an_unknown_source_does_not_hide_that_an_input_is_missing(lab: Lab):
+    text = lab.faults("mushpipe: 1\nsource: {use: frame}\nstages:\n  b: {use: invert}\n")
+    assert "2:15: unknown source 'frame'; did you mean 'frames'?" in text
+    assert "4:3: nothing above 'b' produces the Mask" in text
+
+
+def test_a_misspelt_setting_within_a_group_is_told_its_neighbours():
+    text = "mushpipe: 1\nsource: {use: synthetic}\nsinks:\n  robot: {use: robot-json, workspace: "
+    text += "{low: [0, 0, 0], high: [1, 1, 1], lo: 1}}\n"
+    with pytest.raises(GraphError, match=r"4:73: unknown setting 'lo' of 'robot-json'") as raised:
+        compile_document(parse_document(text, "graph.yaml", Path()), load_registry())
+    assert "did you mean 'low'?" in str(raised.value)
+
+
+def test_two_sinks_on_one_file_are_a_fault(lab: Lab):
+    lab.registry.sink("mcap", McapSink)
+    text = lab.faults("""
+        mushpipe: 1
+        source: {use: frames}
+        sinks:
+          a: {use: mcap, path: "x/{recording}.mcap"}
+          b: {use: mcap, path: "./x/../x/{recording}.mcap"}
+          c: {use: mcap, path: "y/{recording}.mcap"}
+    """)
+    path = f"{lab.folder.absolute()}/x/{{recording}}.mcap"
+    said = f"graph.yaml:5:24: sink 'b' would write over the file of sink 'a', {path}\n"
+    assert text.startswith(said)
+    assert text.count("would write over") == 1
+
+
 def test_a_missing_setting_is_placed_at_its_plugin(lab: Lab):
     class Needy(Sink):
         size: int

@@ -1,6 +1,7 @@
 """`--set` and `--source`: what they change, and what they refuse."""
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -10,8 +11,10 @@ from pydantic import Field
 
 from mushpipe import Circles, RgbdFrame, Stage
 from mushpipe.core.document import Document, parse_document
+from mushpipe.core.graph import compile_document
 from mushpipe.core.overrides import apply_override
-from tests.core.lab import Lab, circles, cli
+from mushpipe.core.plugins import load_registry
+from tests.core.lab import Frames, Lab, circles, cli
 
 GRAPH = """
 mushpipe: 1
@@ -44,6 +47,7 @@ def document() -> Document:
         ("segment.note=a=b", ("stages", "segment", "note"), "a=b"),
         ("segment.note=[1", ("stages", "segment", "note"), "[1"),
         ("segment.note=2024-05-01", ("stages", "segment", "note"), "2024-05-01"),
+        ("out.path=-", ("sinks", "out", "path"), "-"),
         (" segment.level =9", ("stages", "segment", "level"), 9),
         ("segment.new.deep=1", ("stages", "segment", "new", "deep"), 1),
     ],
@@ -182,7 +186,7 @@ def test_source_names_a_recording_or_a_plugin(lab: Lab):
     lab.registry.source("mcap", "mushpipe.sources.mcap:McapSource")
     plan = lab.compile(GRAPH, source="my/bed.mcap")
     assert (plan.source.use, str(plan.source.plugin.path)) == ("mcap", "my/bed.mcap")
-    assert plan.overrides == ("--source my/bed.mcap",) * 3
+    assert plan.overrides == ("--source my/bed.mcap",)
     assert lab.compile(GRAPH, source="frames").source.use == "frames"
 
 
@@ -211,3 +215,23 @@ def test_a_setting_goes_by_its_name_in_the_file(lab: Lab):
     assert plan.stages[0].plugin.global_ == 3
     assert plan.warnings == ()
     assert "did you mean 'global'?" in lab.faults(lab.chain("keyword"), "a.globl=1")
+
+
+def test_a_name_that_is_no_utf8_is_told_of(lab: Lab):
+    name = os.fsdecode(b"\xff.mcap")
+    text = lab.faults(GRAPH, f"source.path={name}")
+    assert text == f"--set source.path={name}: this is not UTF-8: give the file another name"
+    text = lab.faults(GRAPH, source=name)
+    assert text == f"--source {name}: this is not UTF-8: give the file another name"
+
+
+def test_a_misspelt_source_is_no_recording(lab: Lab):
+    graph = "mushpipe: 1\nsource: {use: frames}\n"
+    registry = load_registry()
+    said = "'framess' is neither a file nor a source; did you mean 'frames'?"
+    registry.source("frames", Frames)
+    plan = compile_document(parse_document(graph, "g.yaml", Path()), registry, (), "framess")
+    assert plan.warnings == (said,)
+    plan = compile_document(parse_document(graph, "g.yaml", Path()), registry, (), "bed.mcap")
+    assert plan.warnings == ()
+    assert plan.overrides == ("--source bed.mcap",)

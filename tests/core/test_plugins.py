@@ -264,6 +264,7 @@ def test_a_file_is_loaded_once_so_that_its_types_agree(lab: Lab):
     [
         (None, "mine.py:Mine", "there is no file {file}"),
         (FILE, "mine.py:Mein", "{file} has no class 'Mein'; did you mean 'Mine'?"),
+        (FILE, "mine.py", "'mine.py' says no class: write 'mine.py:CLASS'; it has Mine"),
         ("", "mine.py:Mine", "{file} has no class 'Mine'; none is known here"),
         ("1 / 0", "mine.py:X", "{file} cannot be imported: ZeroDivisionError: division by zero"),
         ("exit(3)", "mine.py:X", "{file} cannot be imported: SystemExit: 3"),

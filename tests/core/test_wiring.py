@@ -298,3 +298,16 @@ def test_an_output_that_nobody_takes_is_a_warning(lab: Lab):
 def test_a_sink_that_records_everything_takes_every_output(lab: Lab):
     assert lab.compile(lab.chain("threshold", "both")).warnings == ()
     assert Trace in {p.type for p in lab.compile(lab.chain("both")).sinks[0].ports.inputs}
+
+
+def test_everything_that_stages_found_comes_from_no_stage_alone(lab: Lab):
+    fault = lab.faults(
+        "mushpipe: 1\nsource: {use: frames}\nstages:\n  a: {use: threshold}\n"
+        "sinks:\n  out: {use: collect, inputs: {trace: a}}\n"
+    )
+    assert fault == (
+        "graph.yaml:6:32: 'trace' of 'collect' is everything that all stages found\n"
+        "      out: {use: collect, inputs: {trace: a}}\n"
+        "                                   ^\n"
+        "    leave it out"
+    )

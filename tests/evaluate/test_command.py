@@ -105,6 +105,17 @@ def test_truth_is_found_in_the_recording_the_results_name(
     assert metrics(judged(results, "--truth", write_recording(recording, truths)))["f"] == 1
 
 
+def test_truth_of_another_recording_is_told_of(tmp_path: Path, truths: dict[int, Any]) -> None:
+    recording = write_recording(tmp_path / "bed.mcap", truths)
+    answers = {i: picks_of(truth) for i, truth in truths.items()}
+    manifest = manifest_of(recording, "bed.mcap")
+    results = write_results(tmp_path / "r.mcap", answers, manifest=manifest)
+    other = write_recording(tmp_path / "other.mcap", {i: bed(7) for i in truths})
+    said = "the truth is that of other.mcap; what was played is bed.mcap"
+    assert said in run(results, "--truth", other).stdout
+    assert "what was played" not in run(results, "--truth", recording).stdout
+
+
 def test_a_frame_that_failed_is_missed_though_the_results_copy_no_truth_of_it(
     tmp_path: Path, truths: dict[int, Any]
 ) -> None:

@@ -175,7 +175,7 @@ def test_wrong_labels_are_refused_with_their_place(
 
 
 def test_files_that_are_not_there_or_no_json(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such"):
+    with pytest.raises(UsageError, match="no such"):
         read_truth(tmp_path / "none.json")
     (tmp_path / "bad.json").write_text("{")
     with pytest.raises(InputError, match="no labels"):

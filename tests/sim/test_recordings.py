@@ -75,3 +75,8 @@ def test_the_planes_show_the_papers_depth_error(name):
         window = frame.depth_m[224:255, 304:335] - distance
         assert 0.002 < np.nanmean(window) < 0.0038
         assert 0.0006 < np.nanstd(window) < 0.0016
+
+
+def test_the_table_is_missed_outside_of_the_project(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"run this in the project's folder"):
+        definitions(tmp_path / "recordings.yaml")
