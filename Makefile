@@ -48,8 +48,9 @@ types: $(STAMP)-dev
 docs: $(STAMP)-dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --site-dir out/site
 
+# On two cores in three fifths of the time. Fixtures of a file are made once: a file stays on one core.
 unit: $(STAMP)-dev
-	$(BIN)/pytest -m 'not slow'
+	$(BIN)/pytest -m 'not slow' --numprocesses auto --maxprocesses 2 --dist loadfile
 
 test-slow: $(STAMP)-dev system-libraries
 	$(BIN)/pytest -m slow

@@ -132,7 +132,7 @@ def test_of_several_topics_one_must_be_chosen(two: Path) -> None:
 
 
 def test_a_topic_without_picks_is_refused(two: Path) -> None:
-    with pytest.raises(InputError, match=r"no picks on /mushpipe/c \(it holds /mushpipe/a, /"):
+    with pytest.raises(UsageError, match=r"no picks on /mushpipe/c; they are on /mushpipe/a, /"):
         list(csv_lines(two, "/mushpipe/c"))
 
 
