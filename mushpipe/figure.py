@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from itertools import islice
+from string import ascii_lowercase
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -61,7 +62,7 @@ def draw_localization(trace: Trace) -> Figure:
     Raises:
         UsageError: The frame has no depth, no circles or no locations.
     """
-    circles, locations = _last(trace, Circles), _last(trace, Locations)
+    circles, locations = _located(trace)
     frame = trace.frame
     if frame.depth is None:
         raise UsageError(f"frame {frame.header.sequence} has no depth to draw")
@@ -89,7 +90,7 @@ def draw_diameter(trace: Trace) -> Figure:
     Raises:
         UsageError: The frame has no circles or no locations.
     """
-    circles, locations = _last(trace, Circles), _last(trace, Locations)
+    circles, locations = _located(trace)
 
     def draw(axes: Axes) -> None:
         _rings(axes, circles)
@@ -113,7 +114,7 @@ def draw_pose(trace: Trace, settings: Mapping[str, Any], most: int = 3) -> Figur
     """
     from mushpipe.stages.registration import Registration
 
-    circles, locations = _last(trace, Circles), _last(trace, Locations)
+    circles, locations = _located(trace)
     stage = Registration.model_validate(dict(settings))
     best = np.argsort(-circles.score, kind="stable")
     # the frame that the stage got, where the recording has it: its depth may have been corrected
@@ -151,6 +152,23 @@ def _last(trace: Trace, kind: type[T]) -> T:
     return found[-1]
 
 
+def _located(trace: Trace) -> tuple[Circles, Locations]:
+    """Return the last locations with their circles: those of the same stage, or the last above."""
+    locations = _last(trace, Locations)
+    circles = _last(trace, Circles)
+    for values in trace.outputs.values():
+        own = [value for value in values if isinstance(value, Circles)]
+        circles = own[-1] if own else circles
+        if any(value is locations for value in values):
+            break
+    if len(circles) != len(locations):
+        raise UsageError(
+            f"frame {trace.frame.header.sequence} has {len(locations)} locations, and "
+            f"{len(circles)} circles above them: they belong to others"
+        )
+    return circles, locations
+
+
 def _lay_out(panels: list[Panel], columns: int, scale: float = 1.0) -> Figure:
     from matplotlib.figure import Figure
 
@@ -160,8 +178,9 @@ def _lay_out(panels: list[Panel], columns: int, scale: float = 1.0) -> Figure:
     figure = Figure(figsize=(columns * size, rows * (size * height / width + 0.3)), dpi=DPI)
     figure.set_layout_engine("constrained", w_pad=0.03, h_pad=0.03)
     places = list(np.ravel(figure.subplots(rows, columns)))
-    for letter, axes, panel in zip("abcdefghijkl", places, panels, strict=False):
+    for number, (axes, panel) in enumerate(zip(places, panels, strict=False)):
         axes.imshow(panel.image, cmap="gray", interpolation="nearest")
+        letter = ascii_lowercase[number] if number < len(ascii_lowercase) else number + 1
         label = f"({letter}) " if len(panels) > 1 else ""
         axes.set_title(f"{label}{panel.title}", fontsize=10)
         axes.set_autoscale_on(False)  # a circle over the border makes no panel larger

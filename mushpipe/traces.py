@@ -15,7 +15,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.recording import MANIFEST, Raw, RecordingReader
-from mushpipe.core.types import Mask, RgbdFrame, Trace
+from mushpipe.core.types import Header, Mask, RgbdFrame, Trace
 from mushpipe.core.wire import (
     COLOR_TOPIC,
     NO_DEPTH,
@@ -25,12 +25,36 @@ from mushpipe.core.wire import (
     decode_table,
 )
 
+LOST = 256  # results of so many frames without images are kept, in case those come later
+
 
 def read_manifest(path: Path) -> dict[str, Any]:
-    """Return what the run that wrote a recording was made of; empty where it does not say."""
+    """Return what the run that wrote a recording was made of; empty where it does not say.
+
+    Raises:
+        InputError: What it says is no JSON object.
+    """
     stored = RecordingReader(path).index().metadata.get(MANIFEST, {})
-    manifest: dict[str, Any] = json.loads(stored.get("json", "{}"))
+    try:
+        manifest = json.loads(stored.get("json", "{}"))
+    except ValueError:
+        manifest = None
+    if not isinstance(manifest, dict):
+        raise InputError(f"{path}: its metadata '{MANIFEST}' hold no JSON object")
     return manifest
+
+
+def stage_times(message: bytes) -> dict[str, int]:
+    """Return the ns that each stage took, from a message on the topic of times.
+
+    Raises:
+        ValueError: It says nothing of the kind.
+    """
+    content = orjson.loads(message)
+    times = content.get("stages_ns") if isinstance(content, dict) else None
+    if not isinstance(times, dict) or not all(isinstance(ns, int) for ns in times.values()):
+        raise ValueError("expected {stages_ns: {stage: ns}}")
+    return times
 
 
 def source_recording(results: Path, manifest: Mapping[str, Any]) -> Path | None:
@@ -84,15 +108,13 @@ def read_traces(path: Path) -> Iterator[Trace]:
         images = {k: given[k] for k in given if k not in ("use", "speed", "loop")} | {"path": found}
     order = list(manifest.get("graph", {}).get("stages", {}))
     reader = RecordingReader(path)
-    groups = _groups(reader)
-    key, messages = next(groups, (None, []))
+    results = _Results(reader)
     for frame in McapSource.model_validate(images).frames():
-        trace = Trace(frame, {}, {})
-        while key is not None and key[1] < frame.header.sequence:  # of a frame that was lost
-            key, messages = next(groups, (None, []))
-        if (frame.header.stamp_ns, frame.header.sequence) == key:
-            trace = _trace(frame, messages, order)
-            key, messages = next(groups, (None, []))
+        try:
+            trace = _trace(frame, results.take(frame.header), order)
+        except (ValueError, KeyError, TypeError) as error:
+            at = f"the results of frame {frame.header.sequence}"
+            raise InputError(f"{path}: {at} cannot be read: {error}") from error
         yield trace
     if reader.damage:
         raise InputError(f"{path} is damaged: {'; '.join(reader.damage)}")
@@ -113,16 +135,33 @@ def read_trace(path: Path, sequence: int) -> Trace:
     raise UsageError(f"{path}: there is no frame {sequence}; it holds {seen[0]} to {seen[-1]}")
 
 
-def _groups(reader: RecordingReader) -> Iterator[tuple[tuple[int, int], list[Raw]]]:
-    """Yield the stamp and number of each frame with its results; stamps may stand still."""
+class _Results:
+    """The results of a recording, frame by frame.
 
-    def frame(raw: Raw) -> tuple[int, int]:
-        return raw.message.publish_time, raw.message.sequence
+    They come as they were written, the frames by log time within a chunk, which may go back: what
+    is read too early waits.
+    """
 
-    topics = {t for t in reader.index().channels if t.startswith(RESULT_PREFIX)}
-    if topics:
-        for key, group in groupby(reader.messages(topics), frame):
-            yield key, list(group)
+    def __init__(self, reader: RecordingReader) -> None:
+        topics = {t for t in reader.index().channels if t.startswith(RESULT_PREFIX)}
+        messages = reader.messages(topics, as_written=True) if topics else ()
+        self._groups = groupby(
+            messages, lambda raw: (raw.message.sequence, raw.message.publish_time)
+        )
+        self._waiting: dict[tuple[int, int], list[Raw]] = {}
+        self._read = -1  # number of the last frame
+
+    def take(self, header: Header) -> list[Raw]:
+        """Return the messages of a frame, none where there are none; stamps may stand still."""
+        wanted = header.sequence, header.stamp_ns
+        while wanted not in self._waiting and self._read < header.sequence:
+            key, group = next(self._groups, (None, ()))
+            if key is None:
+                break
+            self._waiting[key], self._read = list(group), key[0]
+            if len(self._waiting) > LOST:
+                del self._waiting[next(iter(self._waiting))]
+        return self._waiting.pop(wanted, [])
 
 
 def _trace(frame: RgbdFrame, messages: list[Raw], order: list[str]) -> Trace:
@@ -134,7 +173,7 @@ def _trace(frame: RgbdFrame, messages: list[Raw], order: list[str]) -> Trace:
         stage, _, part = raw.channel.topic.removeprefix(RESULT_PREFIX).partition("/")
         schema = raw.schema.name if raw.schema else ""
         if raw.channel.topic == TIMING_TOPIC:
-            durations = orjson.loads(raw.message.data)["stages_ns"]
+            durations = stage_times(raw.message.data)
         elif schema in TABLES:
             decoded = decode_table(schema, raw.message.data)
             outputs[stage] = (*outputs.get(stage, ()), decoded.table if decoded else None)
@@ -145,6 +184,8 @@ def _trace(frame: RgbdFrame, messages: list[Raw], order: list[str]) -> Trace:
                 images[stage]["depth"] = (None, frame.depth_scale)
     last = frame
     for stage, parts in images.items():
+        if parts.keys() == {"initial"}:  # of a mask that was lost
+            continue
         value = _of_images(last, parts)
         last = value if isinstance(value, RgbdFrame) else last
         outputs[stage] = (value, *outputs.get(stage, ()))

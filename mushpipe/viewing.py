@@ -48,8 +48,9 @@ def figure(
     trace = read_trace(results, frame)
     if kind is FigureKind.pose:
         graph = read_manifest(results).get("graph", {})
-        stages = [s for s in graph.get("stages", {}).values() if s["use"] == "registration"]
-        settings = {k: v for s in stages[:1] for k, v in s.items() if k not in ("use", "inputs")}
+        stages = graph.get("stages", {}).values()
+        stages = [s for s in stages if s["use"].rpartition(":")[2] == "registration"]
+        settings = {k: v for s in stages[-1:] for k, v in s.items() if k not in ("use", "inputs")}
         drawn = draw_pose(trace, settings)
     else:
         drawn = KINDS[kind](trace)

@@ -16,7 +16,7 @@ from mushpipe.core.overrides import apply_override, not_utf8
 from mushpipe.core.plan import Node, Plan
 from mushpipe.core.plugins import Registry
 from mushpipe.core.stage import WORDS, Kind, Plugin, Source, ports_of, settings_of
-from mushpipe.core.wire import RESULT_PREFIX, TIMING_TOPIC
+from mushpipe.core.wire import RESULT_PREFIX, TIMING_TOPIC, TOTAL
 from mushpipe.core.wiring import wire
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
@@ -155,6 +155,8 @@ def _check_names(
             message = f"'{name}' is a key of the graph file and cannot name a stage or sink"
         elif at[0] == "stages" and RESULT_PREFIX + name == TIMING_TOPIC:
             message = f"'{name}' cannot name a stage: its results would stand where times do"
+        elif at[0] == "stages" and name == TOTAL:
+            message = f"'{name}' cannot name a stage: so is the time of all of them called"
         elif at[0] == "sinks" and name in stages:
             message = f"a stage is called '{name}' already"
         if message:

@@ -88,9 +88,16 @@ class RecordingReader:
             raise InputError(f"{path}: not an MCAP file (it begins with {magic!r})")
 
     def messages(
-        self, topics: set[str] | None = None, start_ns: int = 0, end_ns: int | None = None
+        self,
+        topics: set[str] | None = None,
+        start_ns: int = 0,
+        end_ns: int | None = None,
+        as_written: bool = False,
     ) -> Iterator[Raw]:
-        """Yield the messages of some topics (default all) with start_ns <= log_time < end_ns."""
+        """Yield the messages of some topics (default all) with start_ns <= log_time < end_ns.
+
+        They come by log time within each chunk, or in the order in which they were written.
+        """
         index, seen = self.index(), 0
         # A chunk that is skipped or corrupt may be the one that declares them.
         channels, schemas = dict(index.by_id), dict(index.schemas)
@@ -102,7 +109,7 @@ class RecordingReader:
             past = end_ns is not None and chunk.message_start_time >= end_ns
             return chunk.message_end_time >= start_ns and not past
 
-        for record in self._records(overlaps):
+        for record in self._records(overlaps, as_written):
             if isinstance(record, Schema):
                 schemas[record.id] = record
             elif isinstance(record, Channel):
@@ -117,7 +124,9 @@ class RecordingReader:
         if not start_ns and end_ns is None and seen < index.counts.total() and not self.damage:
             self._note(f"{index.counts.total() - seen} of its messages are missing")
 
-    def _records(self, wanted: Callable[[Chunk], bool]) -> Iterator[McapRecord]:
+    def _records(
+        self, wanted: Callable[[Chunk], bool], as_written: bool = False
+    ) -> Iterator[McapRecord]:
         with self.path.open("rb") as file:
             limit = self.path.stat().st_size
             reader = StreamReader(file, emit_chunks=True, record_size_limit=limit)
@@ -131,13 +140,13 @@ class RecordingReader:
                     if not isinstance(record, Chunk):
                         yield record
                     elif wanted(record):
-                        yield from self._unpack(record)
+                        yield from self._unpack(record, as_written)
             except InvalidMagic:
                 self._note("its last bytes are missing")
             except GARBAGE:
                 self._note("it breaks off: the recorder did not close it, or bytes are missing")
 
-    def _unpack(self, chunk: Chunk) -> list[McapRecord]:
+    def _unpack(self, chunk: Chunk, as_written: bool) -> list[McapRecord]:
         try:
             if chunk.uncompressed_size > 2**32:
                 raise ValueError("implausible size")
@@ -145,6 +154,8 @@ class RecordingReader:
         except GARBAGE as error:
             self._note(f"a chunk is corrupt ({error})")
             return []
+        if as_written:
+            return records
         # Only messages move, and all to the end: a channel is always known before its messages.
         messages = [r for r in records if isinstance(r, McapMessage)]
         others = [r for r in records if not isinstance(r, McapMessage)]

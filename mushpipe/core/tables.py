@@ -255,6 +255,7 @@ class Picks(Columns):
     def check(self) -> None:
         """Ids are unique, and a pick without depth carries no position."""
         self._require(first_of(self.id), "ids must be unique")
+        self._require(self.source <= max(DepthSource), "the source must be a DepthSource")
         present = self.source != DepthSource.MISSING
         for name in ("position", "surface"):
             known = _known(getattr(self, name))

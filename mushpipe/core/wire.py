@@ -25,6 +25,7 @@ DEPTH_TOPIC = "/camera/aligned_depth_to_color/image_raw"
 CAMERA_TOPIC = "/camera/color/camera_info"
 RESULT_PREFIX = "/mushpipe/"
 TIMING_TOPIC = "/mushpipe/timing"
+TOTAL = "total"  # how the time of all stages together is called
 NO_DEPTH = {"depth": "none"}  # metadata of the colour of a stage's frame without depth
 DRAWINGS = ("foxglove.ImageAnnotations", "foxglove.SceneUpdate")  # made of the tables beside them
 # name here -> name in ROS and Foxglove
@@ -266,7 +267,10 @@ def decode_table(schema_name: str, data: bytes, log_time: int = 0) -> Decoded | 
     for item in fields(cls):
         value = body[item.name]
         if "shape" in item.metadata:
-            value = np.array(value, dtype=item.metadata["dtype"])
+            try:
+                value = np.array(value, dtype=item.metadata["dtype"])
+            except OverflowError as error:
+                raise ValueError(f"{item.name}: {error}") from error
             value = value.reshape(-1, *item.metadata["shape"])
         values[item.name] = value
     return Decoded(header, cls(**values))

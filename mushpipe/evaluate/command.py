@@ -30,6 +30,7 @@ from mushpipe.evaluate.running import (
     recordings_in,
     require_results,
     result_path,
+    unique_names,
 )
 from mushpipe.evaluate.speed import named, speed_of
 from mushpipe.evaluate.thresholds import Outcome, check, parse_threshold, require_known
@@ -155,9 +156,10 @@ def _judge_files(request: Request) -> Evaluation:
     files = recordings_in(request.targets)
     truths = _given_truth(request, len(files))
     evaluation = Evaluation(request.rules)
-    for file, truth in zip(files, truths, strict=True):
+    for file, truth, name in zip(files, truths, unique_names(files), strict=True):
         results = read_results(file, request.topic)
-        judged = judge_results(results, truth or find_truth(results), request.rules)
+        known = truth or find_truth(results)
+        judged = judge_results(results, known, request.rules, name=name)
         evaluation.recordings.append(judged)
     _require_judged(evaluation)
     return evaluation
@@ -193,7 +195,7 @@ def _judge_graph(
         if report.error is not None:
             logger.warning("%s: %s", option.label or graph, report.error)
         worst = worst or report.exit_code
-        judged = _judge_run(request, plan, truths[number], recordings[number : number + 1])
+        judged = _judge_run(request, plan, truths[number], recordings, number)
         evaluations[option.label].recordings.append(judged)
     for evaluation in evaluations.values():
         _require_judged(evaluation)
@@ -201,11 +203,14 @@ def _judge_graph(
 
 
 def _judge_run(
-    request: Request, plan: Plan, truth: TruthSet | None, recording: Sequence[Path]
+    request: Request, plan: Plan, truth: TruthSet | None, recordings: Sequence[Path], number: int
 ) -> Judged:
     results = read_results(result_path(plan), request.topic)
     known = truth or find_truth(results)
-    return judge_results(results, known, request.rules, recording[0] if recording else None)
+    if not recordings:
+        return judge_results(results, known, request.rules)
+    name = unique_names(recordings)[number]
+    return judge_results(results, known, request.rules, recordings[number], name)
 
 
 def _with_truth(recordings: list[Path]) -> list[Path]:

@@ -108,7 +108,11 @@ def summarise(name: str, verdicts: Sequence[Verdict], rules: Rules) -> Summary:
 
 
 def judge_results(
-    results: Results, truth: TruthSet, rules: Rules, recording: Path | None = None
+    results: Results,
+    truth: TruthSet,
+    rules: Rules,
+    recording: Path | None = None,
+    name: str = "",
 ) -> Judged:
     """Judge every frame whose truth is known.
 
@@ -120,26 +124,18 @@ def judge_results(
         truth: What is there.
         rules: How to judge.
         recording: What the results were made from, where it is at hand.
+        name: How the recording is called; if not given, after its file.
     """
-    judged = Judged((recording or results.path).stem, results, truth, recording)
+    judged = Judged(name or (recording or results.path).stem, results, truth, recording)
     start = results.manifest.get("graph", {}).get("source", {}).get("start")
     if start and truth.numbered and results.frames and results.frames[0][0].sequence == 0:
         raise UsageError(
             f"{truth.name} labels frames by their number, and the frames of {results.path} are "
             f"counted from {start} s on: label them by 'stamp_ns', or run the whole recording"
         )
-    for header, detections in results.frames:
-        place = truth.place(header)
-        if place is not None:
-            known = truth.frames[place]
-            if known.frame_id is None and detections.frame_id in results.robot_frames:
-                known = replace(known, frame_id=OPTICAL)
-            judged.verdicts.append(judge(judged.name, place, known, header, detections, rules.iou))
+    _judge_frames(judged, rules)
     if foreign := _foreign(results, truth):
         judged.notes.append(foreign)
-    if len(judged.verdicts) < len(results.frames):
-        unknown = len(results.frames) - len(judged.verdicts)
-        judged.notes.append(f"{unknown} frames have no truth and are not judged")
     if not all(map(comparable, judged.verdicts)):
         judged.notes.append("truth and results are in different frames: 3D errors are unknown")
     unanswered = _unanswered(judged)
@@ -150,6 +146,27 @@ def judge_results(
         judged.verdicts.append(judge(judged.name, place, known, None, none_found(), rules.iou))
     judged.verdicts.sort(key=lambda verdict: verdict.place)
     return judged
+
+
+def _judge_frames(judged: Judged, rules: Rules) -> None:
+    """Judge every answered frame whose truth is known, and each truth once."""
+    unknown, places, repeated = 0, set[Place](), 0
+    for header, detections in judged.results.frames:
+        place = judged.truth.place(header)
+        if place is None:
+            unknown += 1
+        elif place in places:
+            repeated += 1
+        else:
+            places.add(place)
+            known = judged.truth.frames[place]
+            if known.frame_id is None and detections.frame_id in judged.results.robot_frames:
+                known = replace(known, frame_id=OPTICAL)
+            judged.verdicts.append(judge(judged.name, place, known, header, detections, rules.iou))
+    if unknown:
+        judged.notes.append(f"{unknown} frames have no truth and are not judged")
+    if repeated:
+        judged.notes.append(f"{repeated} frames repeat the stamp of another and are not judged")
 
 
 def _foreign(results: Results, truth: TruthSet) -> str:

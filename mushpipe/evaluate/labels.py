@@ -19,6 +19,7 @@ Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 Reason = Literal[
     "hidden", "too-small", "too-large", "at-border", "not-upright", "cut-stump", "ambiguous"
 ]
+SHORTEST = 1e-6  # length of an axis that points somewhere
 _STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 
@@ -36,7 +37,7 @@ class Cap(Circle):
     """A mushroom: its circle, and in metres in the camera's optical frame what else is known."""
 
     ignore: bool | Reason = False
-    id: int | None = None
+    id: int | None = Field(None, ge=-(2**63), lt=2**63)
     visible: float | None = Field(None, ge=0, le=1)
     surface_m: Vector | None = None
     apex_m: Vector | None = None
@@ -47,7 +48,7 @@ class Cap(Circle):
     @field_validator("axis")
     @classmethod
     def _direction(cls, axis: list[float] | None) -> list[float] | None:
-        if axis is not None and not any(axis):
+        if axis is not None and not math.hypot(*axis) > SHORTEST:
             raise ValueError("an axis needs a length")
         return axis
 
@@ -123,7 +124,7 @@ def convert(document: Json) -> Json:
 def _must_find(document: Json) -> list[Json]:
     caps = []
     for item in document["must_find"]:
-        first, second = map(_number, item["ellipse_px"][:2])
+        first, second = map(_size, item["ellipse_px"][:2])
         cap = {"u": item["cx"], "v": item["cy"], "radius_px": math.sqrt(first * second) / 2}
         if "diam_silhouette" in item:
             cap["diameter_m"] = _number(item["diam_silhouette"]) / 1000
@@ -150,7 +151,7 @@ def _boxes(document: Json) -> list[Json]:
 
 
 def _box(cap: Json) -> Json:
-    x, y, width, height = map(_number, cap["bbox"])
+    (x, y), (width, height) = map(_number, cap["bbox"][:2]), map(_size, cap["bbox"][2:])
     return {
         "u": x + (width - 1) / 2,
         "v": y + (height - 1) / 2,
@@ -163,6 +164,12 @@ def _number(value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ValueError(f"expected a number, got {value!r}")
     return value
+
+
+def _size(value: Any) -> float:
+    if not (size := _number(value)) > 0:
+        raise ValueError(f"expected a size above 0, got {value!r}")
+    return size
 
 
 def truth_of(caps: list[Cap]) -> Truth:

@@ -42,7 +42,8 @@ def quantities_of(events: Events) -> dict[str, Floats]:
         **_calibration(events),
     }
     for name in _COVERED:
-        finite = np.isfinite(getattr(events, name))
+        value = getattr(events, name)
+        finite = np.isfinite(value) & ((value > 0) | (not name.startswith("sigma")))
         known = finite.all(axis=tuple(range(1, finite.ndim)))
         result[f"has_{name}"] = np.where(found, known, np.nan)
     return result
@@ -69,13 +70,21 @@ def _angles(events: Events) -> dict[str, Floats]:
 
 def _calibration(events: Events) -> dict[str, Floats]:
     """Squared errors over squared stated sigmas; a sigma of 0 counts as not stated."""
-    meant = np.where(events.apex[:, None] == 1, events.true_apex, events.true_surface)
-    position = _z2(events.position - meant, events.sigma_position)
-    angle = np.radians(angle_deg(events.axis, events.true_axis))
+    errors = stated_errors(events)
     return {
-        "z2_position": position.mean(axis=1),
-        "z2_diameter": _z2(events.diameter - events.true_diameter, events.sigma_diameter),
-        "z2_tilt": _z2(angle, events.sigma_tilt),
+        "z2_position": _z2(errors["position"], events.sigma_position).mean(axis=1),
+        "z2_diameter": _z2(errors["diameter"], events.sigma_diameter),
+        "z2_tilt": _z2(errors["tilt"], events.sigma_tilt),
+    }
+
+
+def stated_errors(events: Events) -> dict[str, Floats]:
+    """Return the errors for which sigmas are stated: (N, 3) m, (N,) m and (N,) rad."""
+    meant = np.where(events.apex[:, None] == 1, events.true_apex, events.true_surface)
+    return {
+        "position": events.position - meant,
+        "diameter": events.diameter - events.true_diameter,
+        "tilt": np.radians(angle_deg(events.axis, events.true_axis)),
     }
 
 

@@ -69,7 +69,9 @@ def overlay(verdict: Verdict, frame: RgbdFrame | None) -> str:
         picture = ""
     else:
         height, width = frame.color.shape[:2]
-        picture = f'<image width="{width}" height="{height}" href="{_jpeg(frame)}"/>'
+        picture = (
+            f'<image x="-0.5" y="-0.5" width="{width}" height="{height}" href="{_jpeg(frame)}"/>'
+        )
     size = f'viewBox="-0.5 -0.5 {width} {height}" xmlns="http://www.w3.org/2000/svg"'
     return f'<svg {size} role="img">{picture}{"".join(_circles(verdict))}</svg>'
 

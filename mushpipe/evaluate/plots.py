@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mushpipe.core.tables import Floats
 from mushpipe.evaluate.events import Events, Kind
-from mushpipe.evaluate.metrics import angle_deg, quantities_of
+from mushpipe.evaluate.metrics import angle_deg, quantities_of, stated_errors
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -246,12 +246,12 @@ def _calibration(events: Events) -> tuple[Figure | None, str, str, bool]:
     if not groups:
         return None, title, caption, True
     figure, panels = _axes(len(groups), 1, (10.4 if len(groups) > 1 else 5.2, 2.9))
-    for axes, (label, (sigma, z2)) in zip(panels, groups.items(), strict=True):
+    for axes, (label, (sigma, square, z2)) in zip(panels, groups.items(), strict=True):
         edges = bins_of(sigma)
         bins = np.clip(np.digitize(sigma, edges) - 1, 0, max(0, len(edges) - 2))
         used = np.unique(bins)
         stated = np.array([np.sqrt(np.mean(sigma[bins == b] ** 2)) for b in used])
-        real = np.array([np.sqrt(np.mean(z2[bins == b] * sigma[bins == b] ** 2)) for b in used])
+        real = np.array([np.sqrt(np.mean(square[bins == b])) for b in used])
         end = 1.15 * float(max(stated.max(), real.max()))
         axes.plot([0, end], [0, end], "--", lw=0.9, color=INK, alpha=0.5)
         axes.plot(stated, real, "o-", ms=4, lw=1.2, color=BLUE)
@@ -261,19 +261,25 @@ def _calibration(events: Events) -> tuple[Figure | None, str, str, bool]:
     return figure, title, caption, len(groups) > 1
 
 
-def _stated(events: Events) -> dict[str, tuple[Floats, Floats]]:
-    """Return stated sigmas and squared z-scores of position, diameter and tilt, where known."""
-    quantities = quantities_of(events)
-    root = np.sqrt((events.sigma_position**2).mean(axis=1))
-    sigmas = {
-        "position": ("position, mm", 1e3 * root),
-        "diameter": ("diameter, mm", 1e3 * events.sigma_diameter),
-        "tilt": ("tilt, degrees", np.degrees(events.sigma_tilt)),
-    }
+def _stated(events: Events) -> dict[str, tuple[Floats, Floats, Floats]]:
+    """Return sigmas, squared errors and squared z-scores of position, diameter and tilt.
+
+    Of a position sigma and error are those of one axis, root mean squares over the three.
+    """
+    quantities, errors = quantities_of(events), stated_errors(events)
     result = {}
-    for name, (label, sigma) in sigmas.items():
+    for name, unit, scale in (
+        ("position", "mm", 1e3),
+        ("diameter", "mm", 1e3),
+        ("tilt", "degrees", np.degrees(1)),
+    ):
+        sigma, error = getattr(events, f"sigma_{name}"), errors[name]
+        if sigma.ndim == 1:
+            sigma, error = sigma[:, None], error[:, None]
         z2 = quantities[f"z2_{name}"]
-        known = np.isfinite(z2) & np.isfinite(sigma)
+        known = np.isfinite(z2)
         if known.any():
-            result[label] = (sigma[known], z2[known])
+            root = scale * np.sqrt((sigma[known] ** 2).mean(axis=1))
+            square = ((scale * error[known]) ** 2).mean(axis=1)
+            result[f"{name}, {unit}"] = (root, square, z2[known])
     return result

@@ -223,14 +223,11 @@ def _worst(section: Section) -> str:
     chosen = worst(section.evaluation.verdicts, WORST)
     if not chosen:
         return ""
-    images = {
-        (part.name, place): frame
-        for part in section.evaluation.recordings
-        for place, frame in images_of(part, [v.place for v in chosen if v in part.verdicts]).items()
-    }
-    figures = [
-        _frame(verdict, images.get((verdict.recording, verdict.place))) for verdict in chosen
-    ]
+    images: dict[int, RgbdFrame] = {}  # by verdict: recordings may share names and stamps
+    for part in section.evaluation.recordings:
+        own = {v.place: id(v) for v in chosen if v in part.verdicts}
+        images |= {own[place]: frame for place, frame in images_of(part, own).items()}
+    figures = [_frame(verdict, images.get(id(verdict))) for verdict in chosen]
     legend = "".join(
         f'<span><svg class="frame" viewBox="0 0 22 10"><line class="{style}" x1="0" y1="5" '
         f'x2="22" y2="5"/></svg>{text}</span>'

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import orjson
 from numpy.typing import NDArray
 
 from mushpipe.core.errors import InputError, UsageError, suggest
-from mushpipe.core.recording import MANIFEST, Index, Raw, RecordingReader
+from mushpipe.core.recording import Index, Raw, RecordingReader
 from mushpipe.core.tables import Circles, Columns, Floats, PickFlag, Picks, column
 from mushpipe.core.types import Header
-from mushpipe.core.wire import TIMING_TOPIC, decode_table
+from mushpipe.core.wire import TIMING_TOPIC, TOTAL, decode_table
+from mushpipe.traces import read_manifest, stage_times
 
 PICKS, CIRCLES = "mushpipe.Picks", "mushpipe.Circles"
 
@@ -117,8 +116,7 @@ def read_results(path: Path, topic: str | None = None) -> Results:
         UsageError: Several topics hold some and none is named.
     """
     reader = RecordingReader(path)
-    index = reader.index()
-    manifest = json.loads(index.metadata.get(MANIFEST, {}).get("json", "{}"))
+    index, manifest = reader.index(), read_manifest(path)
     topic = _choose(reader, index, topic)
     results = Results(path, topic, manifest=manifest)
     found: dict[tuple[int, int], tuple[Header, Detections]] = {}
@@ -170,6 +168,9 @@ def _detections(table: Columns) -> Detections:
 
 
 def _add_durations(results: Results, raw: Raw) -> None:
-    stages: dict[str, int] = orjson.loads(raw.message.data)["stages_ns"]
-    for stage, duration in {**stages, "total": sum(stages.values())}.items():
+    try:
+        stages = stage_times(raw.message.data)
+    except ValueError as error:
+        raise InputError(f"{results.path}: a message on {TIMING_TOPIC}: {error}") from error
+    for stage, duration in {**stages, TOTAL: sum(stages.values())}.items():
         results.durations_ms.setdefault(stage, []).append(duration / 1e6)

@@ -72,6 +72,17 @@ def recordings_in(paths: Sequence[Path]) -> list[Path]:
     return found
 
 
+def unique_names(files: Sequence[Path]) -> list[str]:
+    """Return the names of files without folder and suffix, numbered where several have one."""
+    stems, names = [file.stem for file in files], list[str]()
+    for number, stem in enumerate(stems):
+        name = stem if stems.count(stem) == 1 else f"{stem}-{number}"
+        while name in names or (name != stem and name in stems):
+            name += "-"
+        names.append(name)
+    return names
+
+
 def plan_for(
     graph: Path, recording: Path | None, overrides: Iterable[str], out: Path, registry: Registry
 ) -> Plan:
@@ -128,12 +139,10 @@ def plans(
         )
     registry = load_registry()
     sources: Sequence[Path | None] = recordings or [None]
+    names = unique_names(recordings) or ["results"]
     result = []
     for option in options:
-        for number, recording in enumerate(sources):
-            name = "results" if recording is None else recording.stem
-            if [r.stem for r in recordings].count(name) > 1:
-                name = f"{name}-{number}"
+        for number, (name, recording) in enumerate(zip(names, sources, strict=True)):
             file = out / ".".join(filter(None, [name, slug(option), "mcap"]))
             plan = plan_for(graph, recording, [*overrides, *option.overrides], file, registry)
             result.append((option, number, plan))

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from mushpipe.core.wire import TOTAL
 from mushpipe.evaluate.results import Results
 
 
@@ -15,9 +16,9 @@ def speed_of(results: Iterable[Results]) -> dict[str, dict[str, float]]:
     for result in results:
         for stage, durations in result.durations_ms.items():
             pooled.setdefault(stage, []).extend(durations)
-    total = pooled.pop("total", None)
+    total = pooled.pop(TOTAL, None)
     if total is not None:
-        pooled["total"] = total
+        pooled[TOTAL] = total
     return {
         stage: {
             "p50_ms": float(np.percentile(durations, 50)),

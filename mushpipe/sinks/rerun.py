@@ -168,7 +168,8 @@ class RerunSink(Sink):
         rerun_log.set_frame(rec, header)
         self._last = header
         self._lay_out(trace)
-        if header.stamp_ns >= self._next_ns or not self._period_ns:
+        since_ns = header.stamp_ns - self._next_ns + self._period_ns
+        if not 0 <= since_ns < self._period_ns:  # also after a leap, forwards or back
             self._next_ns = header.stamp_ns + self._period_ns
             rerun_log.log_images(images, trace, self.jpeg_quality, self.cloud_step)
             images.settle()

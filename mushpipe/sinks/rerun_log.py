@@ -17,6 +17,7 @@ from mushpipe.sinks import rerun_layout as at
 
 _FEW = 4  # px between those that a statistic is taken of
 FIRST = 20  # picks whose place in the order is written beside them
+CORNER = 0.5  # Rerun counts px from the corner of the first pixel, not from its centre
 _WHEEL = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (213, 94, 0),
           (204, 121, 167), (150, 150, 255), (190, 190, 190))  # fmt: skip
 
@@ -204,7 +205,7 @@ def _rings(table: Circles | Picks, **style: Any) -> Any:
     import rerun as rr
 
     sizes = np.repeat(table.radius[:, None], 2, axis=1)
-    return rr.Ellipses2D(centers=table.center, half_sizes=sizes, draw_order=30, **style)
+    return rr.Ellipses2D(centers=table.center + CORNER, half_sizes=sizes, draw_order=30, **style)
 
 
 def _log_picks(rec: Any, picks: Picks) -> None:
@@ -212,7 +213,7 @@ def _log_picks(rec: Any, picks: Picks) -> None:
 
     rec.log(at.PICKS, _rings(picks, colors=SOURCE_COLORS[picks.source]))
     ids = rr.Points2D(
-        picks.center, radii=0.5, colors=(255, 255, 255), labels=labels(picks),
+        picks.center + CORNER, radii=0.5, colors=(255, 255, 255), labels=labels(picks),
         show_labels=True, draw_order=40,
     )  # fmt: skip
     rec.log(at.IDS, ids)

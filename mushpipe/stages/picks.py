@@ -105,7 +105,7 @@ class MakePicks(Stage):
             ValueError: The inputs differ in their number of rows, or are of different circles.
         """
         n = len(circles)
-        poses = poses or Poses.unknown(n)
+        poses = Poses.unknown(n) if poses is None else poses
         if not n == len(locations) == len(poses):
             raise ValueError(f"{n} circles, {len(locations)} locations, {len(poses)} poses")
         _require_same(circles, locations.position, "location", frame)
@@ -127,6 +127,7 @@ class MakePicks(Stage):
         if self.T_base_camera is not None:
             picks = in_base(picks, self.T_base_camera)
             up = picks.surface[:, 2]
+        picks = replace(picks, sigma_position=_sigma_position(picks))
         chosen = self._chosen(picks, up, hidden)
         self._left_out += n - len(chosen)
         return picks.take(chosen)
@@ -212,17 +213,19 @@ def _require_same(
         )
 
 
-def _sigma_position(locations: Locations, poses: Poses) -> NDArray[np.float64]:
+def _sigma_position(picks: Picks) -> NDArray[np.float64]:
     """Return the sigma (N, 3), m, of the apex where there is a pose, of the surface point else.
 
-    A cap that leans by an angle more than was found, about its middle, has its apex farther by
-    that angle times its height, in any direction across its axis n: the covariance is
+    The picks come with that of the surface point, in the frame in which they are given. A cap that
+    leans by an angle more than was found, about its middle, has its apex farther by that angle
+    times its height, in any direction across its axis n: the covariance is
     (height sigma)^2 (I - n n^T) / 2, sigma being that of the whole angle.
     """
-    height = HEIGHT * locations.diameter
-    across = 0.5 * (height * poses.sigma_rad)[:, None] ** 2 * (1 - poses.axis**2)
-    apex = np.sqrt(locations.sigma_position**2 + across)
-    return np.where(poses.valid[:, None], apex, locations.sigma_position)
+    height = HEIGHT * picks.diameter
+    across = 0.5 * (height * picks.sigma_tilt)[:, None] ** 2 * np.maximum(1 - picks.axis**2, 0)
+    apex = np.sqrt(picks.sigma_position**2 + across)
+    posed = (picks.flags & np.uint32(PickFlag.POSE_UNKNOWN)) == 0
+    return np.where(posed[:, None], apex, picks.sigma_position)
 
 
 def _joined(
@@ -245,7 +248,7 @@ def _joined(
         quaternion=poses.quaternion,
         axis=poses.axis,
         score=circles.score,
-        sigma_position=_sigma_position(locations, poses),
+        sigma_position=locations.sigma_position,
         sigma_diameter=locations.sigma_diameter,
         sigma_tilt=poses.sigma_rad,
         source=locations.source,

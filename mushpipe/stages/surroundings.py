@@ -21,9 +21,9 @@ def hidden_share(circles: Circles, distance: Floats, image: tuple[int, int]) -> 
         image: Width and height, px; what lies outside does not count.
     """
     n = len(circles)
-    order = np.argsort(np.nan_to_num(distance, nan=np.inf), kind="stable")
-    rank = np.empty(n, np.int64)
-    rank[order] = np.arange(n)
+    order = np.argsort(distance, kind="stable")[: np.isfinite(distance).sum()]  # NaN comes last
+    rank = np.full(n, n)
+    rank[order] = np.arange(len(order))
     discs = discs_of(circles)
     ranks = np.full(image[::-1], n, np.int16)
     paint(ranks, discs, order)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -79,6 +80,25 @@ def test_localization_shows_nan_before_and_the_estimate_after() -> None:
     assert texts(before, RED) == [d[0], "NaN"]
     assert texts(after, BLUE) == ["0.500", "0.500"]
     assert texts(after, RED) == d
+
+
+def test_locations_are_drawn_with_the_circles_they_are_of() -> None:
+    trace = scene()
+    more = Circles(np.full((3, 2), 9.0), np.ones(3), np.ones(3))
+    trace.outputs["second"] = (more,)  # a detector below the localizer
+    diameters = draw_diameter(trace).axes[0]
+    assert texts(diameters, RED) == ["41", "NaN"]
+    with pytest.raises(UsageError, match="has 2 locations, and 3 circles above them"):
+        draw_diameter(replace(trace, outputs={"d": (more,), "l": trace.outputs["locate"]}))
+
+
+def test_every_panel_is_drawn() -> None:
+    trace, mask = scene(), Mask(np.ones((24, 32), bool))
+    masks = {f"m{i}": (mask,) for i in range(28)}
+    figure = draw_stages(replace(trace, outputs={**masks, **trace.outputs}))
+    titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
+    assert titles[25].startswith("(z) ")
+    assert titles[-1] == f"({len(titles)}) circles"
 
 
 def test_diameters_stand_at_the_centres_and_unknown_ones_say_so() -> None:

@@ -194,6 +194,12 @@ graph.yaml:1:1: setting 'source' is missing
 }
 
 
+@pytest.mark.parametrize("name", ["timing", "total"])
+def test_names_that_results_use_are_no_stages(lab: Lab, name: str):
+    text = f"mushpipe: 1\nsource: {{use: frames}}\nstages:\n  {name}: {{use: threshold}}\n"
+    assert f"'{name}' cannot name a stage" in lab.faults(text)
+
+
 @pytest.mark.parametrize(("text", "expected"), FAULTS.values(), ids=FAULTS)
 def test_a_fault_is_placed_and_explained(lab: Lab, text: str, expected: str):
     assert lab.faults(text) == expected

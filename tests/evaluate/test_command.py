@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,8 @@ from typer.testing import CliRunner
 
 from mushpipe.cli import app
 from mushpipe.core.errors import EXIT_DAMAGED, EXIT_DIFFERS, InputError, UsageError
+from mushpipe.core.recorder import RecordingWriter
+from mushpipe.evaluate.running import unique_names
 from tests.evaluate.scenes import (
     bed,
     header,
@@ -114,6 +117,34 @@ def test_truth_of_another_recording_is_told_of(tmp_path: Path, truths: dict[int,
     said = "the truth is that of other.mcap; what was played is bed.mcap"
     assert said in run(results, "--truth", other).stdout
     assert "what was played" not in run(results, "--truth", recording).stdout
+
+
+def test_recordings_of_one_name_are_told_apart(tmp_path: Path, truths: dict[int, Any]) -> None:
+    answers = {i: picks_of(truth) for i, truth in truths.items()}
+    paths = [tmp_path / name for name in ("a/bed.mcap", "b/bed.mcap", "bed-1.mcap")]
+    for path in paths:
+        path.parent.mkdir(exist_ok=True)
+        write_results(path, answers, truths)
+    assert unique_names(paths) == ["bed-0", "bed-1-", "bed-1"]
+    names = [r["name"] for r in judged(*paths)["alternatives"][0]["recordings"]]
+    assert names == ["bed-0", "bed-1-", "bed-1"]
+
+
+def test_a_frame_is_judged_once(tmp_path: Path, truths: dict[int, Any]) -> None:
+    path = tmp_path / "r.mcap"
+    writer = RecordingWriter(path, {})
+    for number, at in [
+        (0, header(0)),
+        (0, replace(header(0), sequence=9)),
+        *((i, header(i)) for i in (1, 2)),
+    ]:
+        writer.value("/mushpipe/pick", picks_of(truths[number]), at)
+    writer.close()
+    labels = write_recording(tmp_path / "truth.mcap", truths)
+    content = judged(path, "--truth", labels)["alternatives"][0]
+    assert content["overall"]["frames"] == 3
+    (recording,) = content["recordings"]
+    assert "1 frames repeat the stamp of another and are not judged" in recording["notes"]
 
 
 def test_a_frame_that_failed_is_missed_though_the_results_copy_no_truth_of_it(

@@ -205,6 +205,7 @@ def test_a_sigma_of_zero_is_none() -> None:
     truth = bed(7)
     values = values_of(verdict(truth, picks_of(truth, sigma_tilt=0.0)))
     assert math.isnan(values["calibration_tilt"])
+    assert values["coverage_sigma_tilt"] == 0
 
 
 @pytest.mark.parametrize("case", ["no truth", "nothing found", "nothing matched", "no frame"])

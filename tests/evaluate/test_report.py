@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
+import base64
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
+from mushpipe.evaluate.events import events_of, judge
+from mushpipe.evaluate.plots import _stated
+from mushpipe.evaluate.results import of_picks
+from mushpipe.evaluate.truth import FrameTruth
 from tests.evaluate.scenes import (
+    FRAME,
     bed,
+    frame,
+    header,
     picks_of,
+    write_recording,
     write_results,
 )
-from tests.evaluate.test_command import judged, metrics, run
+from tests.evaluate.test_command import judged, manifest_of, metrics, run
 
 
 class Page(HTMLParser):
@@ -83,3 +94,39 @@ def test_report_of_a_frame_with_nothing_in_it(tmp_path: Path) -> None:
     results = write_results(tmp_path / "r.mcap", {0: picks_of(empty)}, {0: empty})
     assert run(results, "--report", tmp_path / "report").exit_code == 0
     assert np.isnan(float(metrics(judged(results))["f"] or "nan"))
+
+
+def test_a_worst_frame_is_shown_on_its_own_image(tmp_path: Path) -> None:
+    """Two recordings of one name, whose frames have the same stamps."""
+    paths, shown = [], {}
+    for number, folder in enumerate(("a", "b")):
+        (tmp_path / folder).mkdir()
+        truth = bed(number, rows=1 + 3 * number)
+        recording = write_recording(tmp_path / folder / "bed.mcap", {0: truth})
+        manifest = manifest_of(recording, "bed.mcap")
+        found = {0: picks_of(truth.take(np.arange(3)))}
+        results = tmp_path / folder / "results.mcap"
+        paths.append(write_results(results, found, {0: truth}, manifest=manifest))
+        shown[f"results-{number}"] = frame(0, truth).color
+    assert run(*paths, "--report", tmp_path / "report").exit_code == 0
+    text = (tmp_path / "report" / "index.html").read_text()
+    panels = re.findall(r'href="data:image/jpeg;base64,([^"]+)".*?</b> ([^,]+),', text)
+    assert {name for _, name in panels} == set(shown)
+    for data, name in panels:
+        pixels = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
+        assert np.abs(pixels[..., ::-1] - shown[name].astype(float)).mean() < 5
+
+
+def test_the_plot_of_sigmas_shows_the_error_itself() -> None:
+    """Where the sigmas of x, y and z differ, z-scores times the mean sigma are no error."""
+    truth = bed(3)
+    error = np.random.default_rng(1).choice([-0.001, 0.001], (len(truth), 3))
+    picks = picks_of(truth, position=error)
+    sigma = np.tile([0.0002, 0.0002, 0.001], (len(truth), 1))
+    picks = replace(picks, sigma_position=sigma)
+    known = FrameTruth(truth, frame_id=FRAME)
+    events = events_of([judge("bed", ("index", 0), known, header(0), of_picks(picks))])
+    (root, square, z2) = _stated(events)["position, mm"]
+    np.testing.assert_allclose(square, 1, rtol=1e-6)
+    np.testing.assert_allclose(root, np.sqrt((0.04 + 0.04 + 1) / 3))
+    np.testing.assert_allclose(z2, (25 + 25 + 1) / 3, rtol=1e-6)

@@ -141,6 +141,30 @@ def test_conversion_leaves_the_own_format_alone() -> None:
             },
             "an axis needs a length",
         ),
+        (
+            {
+                "mushpipe_labels": 1,
+                "frames": [
+                    {"index": 0, "caps": [{"u": 1, "v": 1, "radius_px": 1, "axis": [1e-200, 0, 0]}]}
+                ],
+            },
+            "an axis needs a length",
+        ),
+        (
+            {
+                "mushpipe_labels": 1,
+                "frames": [{"index": 0, "caps": [{"u": 1, "v": 1, "radius_px": 1, "id": 2**63}]}],
+            },
+            "frames.0.caps.0.id",
+        ),
+        (
+            {"frames": [{"stamp_ns": 1, "caps": [{"bbox": [1, 2, -3, -3]}]}]},
+            "expected a size above 0, got -3",
+        ),
+        (
+            {"must_find": [{"cx": 1, "cy": 2, "ellipse_px": [-3, -3, 0]}]},
+            "expected a size above 0, got -3",
+        ),
         ({"stamp_ns": 1, "caps": [5]}, "labels with 'caps'"),
         (
             {"frames": [{"stamp_ns": 1, "caps": [{"bbox": [True, 2, 3, 4]}]}]},

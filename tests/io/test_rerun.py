@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -133,7 +134,7 @@ def test_a_frame_that_a_stage_changed_has_its_layer(tmp_path: Path) -> None:
 def test_picks_carry_the_place_size_label_and_colour(tmp_path: Path) -> None:
     found = show(tmp_path, [trace_of(make_frame(), detect=make_circles(), pick=make_picks())])
     entity = f"{IMAGE}/picks"
-    assert values(found, entity, "centers") == [[[10.25, 5.5], [20.0, 12.0]]]
+    assert values(found, entity, "centers") == [[[10.75, 6.0], [20.5, 12.5]]]
     (sizes,) = values(found, entity, "half_sizes")
     np.testing.assert_allclose(sizes, [[3.5, 3.5], [1 / 3, 1 / 3]], rtol=1e-6)
     assert values(found, f"{IMAGE}/ids", "labels") == [["7: 40 mm", "8: size unknown"]]
@@ -272,6 +273,18 @@ def test_few_images_and_all_results(tmp_path: Path, settings: dict[str, Any]) ->
     assert (np.diff(stamps) >= 200_000_000).all()
     assert found["/camera/cloud"]["frame"] == found[f"{IMAGE}/color"]["frame"]
     assert len(values(found, f"{IMAGE}/picks", "centers")) == 31
+
+
+def test_images_go_on_after_a_stamp_that_leaps(tmp_path: Path) -> None:
+    shifts = [0, 0, 0, 100, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]  # s
+    traces = []
+    for i, shift in enumerate(shifts):
+        frame = make_frame(i)
+        header = replace(frame.header, stamp_ns=frame.header.stamp_ns + shift * 10**9)
+        traces.append(trace_of(replace(frame, header=header, attached={}), pick=make_picks()))
+    found = show(tmp_path, traces, image_hz=5)
+    assert 4 <= len(found[f"{IMAGE}/color"]["frame"]) <= 6
+    assert found[f"{IMAGE}/color"]["frame"][-1] >= traces[-6].frame.header.sequence
 
 
 def test_the_workspace_of_a_robot_in_the_cameras_frame_is_drawn(tmp_path: Path) -> None:

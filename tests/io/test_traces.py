@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -10,8 +11,11 @@ import numpy as np
 import pytest
 
 from mushpipe import Circles, Locations, Mask, Picks, RunInfo, Trace
+from mushpipe.core import wire
 from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.manifest import _describe
+from mushpipe.core.recorder import RecordingWriter
+from mushpipe.core.recording import MANIFEST
 from mushpipe.sinks.mcap import McapSink
 from mushpipe.sources.mcap import McapSource
 from mushpipe.traces import read_trace, read_traces
@@ -186,3 +190,56 @@ def test_damage_is_reported_after_the_last_good_frame(tmp_path: Path) -> None:
 def test_a_recording_without_results_is_its_frames(tmp_path: Path) -> None:
     path = record(tmp_path / "bed.mcap", [Trace(make_frame(i), {}, {}) for i in range(2)])
     assert [t.outputs for t in read_traces(path)] == [{}, {}]
+
+
+@pytest.mark.parametrize("frames", [True, False])
+def test_times_that_go_back_cost_no_results(tmp_path: Path, frames: bool) -> None:
+    """Small frames share a chunk, whose messages are read by the time they were logged."""
+    traces = []
+    for i, shift in enumerate([0, 0, 0, -50, -50, -50]):
+        trace = full_trace(i)
+        past = trace.frame.header.arrival_ns + shift * 33_000_000
+        header = replace(trace.frame.header, arrival_ns=past)
+        traces.append(replace(trace, frame=replace(trace.frame, header=header, attached={})))
+    source = record(tmp_path / "bed.mcap", [Trace(t.frame, {}, {}) for t in traces])
+    manifest = {
+        "graph": {"source": {"use": "mcap", "path": "bed.mcap"}, "stages": {}},
+        "recordings": [_describe(source)],
+    }
+    sink = McapSink(path=tmp_path / "out.mcap", frames=frames)
+    sink.open(RunInfo("bed", manifest))
+    for trace in traces:
+        sink.consume(trace)
+    sink.close()
+    found = {t.frame.header.sequence: t for t in read_traces(tmp_path / "out.mcap")}
+    assert sorted(found) == [t.frame.header.sequence for t in traces]
+    for trace in traces:
+        again = found[trace.frame.header.sequence]
+        same(trace.outputs["open"][0], again.outputs["open"][0])
+        assert {"segment", "open", "detect", "pick"} <= set(again.outputs)
+
+
+@pytest.mark.parametrize("name", ["pick", "timing"])
+def test_what_cannot_be_read_is_named(tmp_path: Path, name: str) -> None:
+    path, frame = tmp_path / "out.mcap", make_frame()
+    writer = RecordingWriter(path, {MANIFEST: {"json": "{}"}})
+    writer.frame(frame)
+    if name == "pick":
+        (message,) = wire.encoder_of(Picks)(make_picks(), frame.header)
+        body = {**json.loads(message.data), "source": [300, 0]}
+        message = message._replace(data=json.dumps(body).encode())
+    else:
+        message = wire.json_message(wire.TIMING, frame.header, {"stages": 5})
+    writer.write(f"/mushpipe/{name}", message, frame.header)
+    writer.close()
+    with pytest.raises(InputError, match=r"the results of frame 10 cannot be read"):
+        list(read_traces(path))
+
+
+def test_a_manifest_that_is_no_json_is_told_of(tmp_path: Path) -> None:
+    path = tmp_path / "out.mcap"
+    writer = RecordingWriter(path, {MANIFEST: {"json": "{"}})
+    writer.frame(make_frame())
+    writer.close()
+    with pytest.raises(InputError, match=r"'mushpipe\.manifest' hold no JSON object"):
+        list(read_traces(path))

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from mushpipe import Circles, DepthSource, Locations, PickFlag, Picks, Poses
 from mushpipe.stages.picks import MakePicks
+from mushpipe.stages.surroundings import hidden_share
 from tests.stages.scenes import CAMERA, frame_of
 
 NAN = np.nan
@@ -315,3 +316,42 @@ def test_spreads_turn_with_the_axes() -> None:
     quarter = {"frame": "b", "translation": [0, 0, 0], "quaternion": [0, 0, 0.5**0.5, 0.5**0.5]}
     picks = MakePicks(T_base_camera=quarter).process(frame_of(np.zeros((120, 160))), circles, found)
     assert picks.sigma_position[0] == pytest.approx([0.002, 0.001, 0.003])
+
+
+def test_the_sigma_of_a_leaning_apex_turns_with_the_cap() -> None:
+    """Along the cap's axis, here z of the robot's frame, the apex of a leaning cap is as sure."""
+    circles, found = circles_at((50, 50), (80, 50)), locations(*[DepthSource.MEASURED] * 2)
+    found = replace(found, diameter=np.full(2, 0.05), sigma_position=np.zeros((2, 3)))
+    lean = Rotation.from_euler("y", 135, degrees=True)  # takes z to an axis 45 degrees off upright
+    axis = lean.apply([0, 0, 1.0])
+    poses = Poses(
+        quaternion=np.tile(lean.as_quat(), (2, 1)),
+        axis=np.tile(axis, (2, 1)),
+        apex=found.position,
+        sigma_rad=np.full(2, np.radians(20)),
+        fitness=np.ones(2),
+        valid=np.ones(2, bool),
+    )
+    base = {"frame": "b", "translation": [0, 0, 0], "quaternion": [*lean.inv().as_quat()]}
+    picks = MakePicks(T_base_camera=base).process(
+        frame_of(np.zeros((120, 160))), circles, found, poses
+    )
+    across = 0.3 * 0.05 * np.radians(20) / np.sqrt(2)
+    np.testing.assert_allclose(picks.sigma_position[0], [across, across, 0], atol=1e-9)
+
+
+def test_a_mushroom_without_depth_hides_nothing() -> None:
+    circles = circles_at((50, 50), (56, 50), (62, 50))
+    depth = np.array([NAN, NAN, 0.5])
+    shares = hidden_share(circles, depth, (160, 120))
+    swapped = hidden_share(circles.take(np.array([1, 0, 2])), depth, (160, 120))
+    assert shares[2] == 0
+    assert shares.tolist() == swapped[[1, 0, 2]].tolist()
+    alone = hidden_share(circles.take(np.array([0, 1])), depth[:2], (160, 120))
+    assert alone.tolist() == [0, 0]
+
+
+def test_poses_of_no_rows_are_refused() -> None:
+    circles, found = circles_at((50, 50), (80, 50)), locations(*[DepthSource.MEASURED] * 2)
+    with pytest.raises(ValueError, match="2 circles, 2 locations, 0 poses"):
+        MakePicks().process(frame_of(np.zeros((120, 160))), circles, found, Poses.unknown(0))
