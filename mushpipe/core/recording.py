@@ -14,9 +14,19 @@ from typing import BinaryIO, NamedTuple
 
 from mcap.exceptions import InvalidMagic, McapError
 from mcap.reader import SeekingReader
-from mcap.records import Attachment, Channel, Chunk, DataEnd, McapRecord, Metadata, Schema
+from mcap.records import (
+    Attachment,
+    Channel,
+    Chunk,
+    DataEnd,
+    McapRecord,
+    Metadata,
+    Schema,
+    Statistics,
+)
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.summary import Summary
 from zstandard import ZstdError
 
 from mushpipe.core.errors import InputError, UsageError
@@ -198,6 +208,7 @@ class RecordingReader:
             summary = reader.get_summary()
             if summary is None or summary.statistics is None:
                 raise ValueError("no summary")
+            _require_complete(summary, summary.statistics)
             counts: Counter[str] = Counter()
             for channel_id, count in summary.statistics.channel_message_counts.items():
                 counts[summary.channels[channel_id].topic] += count
@@ -231,3 +242,15 @@ class RecordingReader:
             elif isinstance(record, Attachment):
                 index.attachments.append(record.name)
         return index
+
+
+def _require_complete(summary: Summary, statistics: Statistics) -> None:
+    """Raise ValueError where a summary leaves out what it may: then the file has to be read."""
+    stated = {
+        "counts": bool(statistics.channel_message_counts) or not statistics.message_count,
+        "schemas": all(c.schema_id in (0, *summary.schemas) for c in summary.channels.values()),
+        "metadata": statistics.metadata_count == len(summary.metadata_indexes),
+        "attachments": statistics.attachment_count == len(summary.attachment_indexes),
+    }
+    if missing := [name for name, whole in stated.items() if not whole]:
+        raise ValueError(f"the summary lacks {', '.join(missing)}")

@@ -106,12 +106,12 @@ class Lateness:
 
         Args:
             own_ms: Its time on the camera's clock.
-            stamp_ns: That as ns since the epoch; another difference of the two says that the
-                camera was lost, and nothing is known of its clock any more.
+            stamp_ns: That as ns since the epoch; another difference of the two, or a time that went
+                back, says that nothing is known of its clock any more: the camera was lost, say.
             arrived_s: Monotonic time of its arrival.
         """
         own_s, anchor_ns = own_ms / 1e3, stamp_ns - round(own_ms * 1e6)
-        if abs(anchor_ns - self._anchor_ns) > 1e6:
+        if abs(anchor_ns - self._anchor_ns) > 1e6 or own_s < self._own_s:
             self._least = inf
         delay = arrived_s - own_s
         self._least = min(delay, self._least + DRIFT * abs(own_s - self._own_s))

@@ -85,7 +85,6 @@ class Hub:
         self._begin = clock.monotonic()
         # A source that has delivered nothing yet has not been seen to work.
         self._read = (0, self._begin - settings.stall_s)
-        self._seen = 0
         self._cache: tuple[tuple[int, int, int], bytes, dict[Reason, int], bool] | None = None
 
     def name(self, name: str, session: Leaving) -> None:
@@ -110,10 +109,6 @@ class Hub:
         count = self._frames_read()
         if count != self._read[0]:
             self._read = (count, now)
-        result = self.newest
-        if result is not None and result.seq != self._seen:
-            self._seen = result.seq
-            self.ledger.see(result.choice.seen, now)
         self.ledger.settle(now)
 
     def state(self, now: float) -> State:
@@ -190,8 +185,7 @@ class Hub:
 
     def free(self, result: Result) -> list[Target]:
         """Return the targets nobody has claimed, best first."""
-        hidden = self.ledger.hidden()
-        return [target for target in result.choice.targets if target.id not in hidden]
+        return [t for t in result.choice.targets if not self.ledger.hides(t.id)]
 
     def offered(self, result: Result) -> list[Target]:
         """Return the first of them, as many as may be sent."""
@@ -223,7 +217,7 @@ class Hub:
             Refusal: See `Ledger.apply`; `stale` where a robot accepts a target, not one that it
                 holds already, and nobody knows any more whether it is there.
         """
-        if outcome == "accepted" and target not in self.ledger.hidden():
+        if outcome == "accepted" and not self.ledger.hides(target):
             self.fresh(now, self.settings.max_age_s)
         listed = self.newest.choice.targets if self.newest else ()
         visible = any(target == known.id for known in listed)

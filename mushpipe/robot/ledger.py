@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
-from math import inf
 from typing import Literal
 
 from mushpipe.robot.messages import Refusal
 
 Outcome = Literal["accepted", "rejected", "done", "failed"]
-# What is done and out of sight for so long does not come back; its entry may go.
-FORGET_S = 600.0
 MOST_ENTRIES = 4096
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Entry:
     owner: str
-    done: bool
     until: float
-    seen: float
-
-    def ends(self) -> float:
-        return self.seen + FORGET_S if self.done else self.until
 
 
 class Ledger:
@@ -36,23 +27,18 @@ class Ledger:
         self.version = 0
         self._claim_s = claim_s
         self._entries: dict[int, _Entry] = {}
+        self._done: dict[int, str] = {}  # for good, with its owner: ids never come twice
 
     def settle(self, now: float) -> None:
         """Restore what was claimed or held for long enough."""
-        over = [key for key, entry in self._entries.items() if now >= entry.ends()]
+        over = [key for key, entry in self._entries.items() if now >= entry.until]
         for key in over:
             del self._entries[key]
         self.version += bool(over)
 
-    def see(self, ids: Iterable[int], now: float) -> None:
-        """Note which mushrooms are visible, targets or not."""
-        for key in ids:
-            if key in self._entries:
-                self._entries[key].seen = now
-
-    def hidden(self) -> frozenset[int]:
-        """Return the ids that are not to be offered to anybody."""
-        return frozenset(self._entries)
+    def hides(self, target: int) -> bool:
+        """Return whether a target is not to be offered to anybody."""
+        return target in self._entries or target in self._done
 
     def apply(
         self, owner: str, target: int, outcome: Outcome, hold_s: float, visible: bool, now: float
@@ -65,18 +51,22 @@ class Ledger:
         """
         self.settle(now)
         entry = self._entries.get(target)
-        if entry is None and not visible:
+        holder = self._done.get(target, entry.owner if entry else None)
+        if holder is None and not visible:
             raise Refusal("unknown_target", f"m{target} is neither visible nor accepted")
-        if entry is not None and entry.owner != owner:
+        if holder not in (None, owner):
             raise Refusal("conflict", f"m{target} is held by another robot")
-        if entry is not None and entry.done:
+        if target in self._done:
             return "removed"  # for good, whatever is said later
         self.version += 1
-        if outcome in ("accepted", "done") or hold_s > 0:
+        self._entries.pop(target, None)
+        if outcome == "done":
+            self._done[target] = owner
+            return "removed"
+        if outcome == "accepted" or hold_s > 0:
             if entry is None and len(self._entries) >= MOST_ENTRIES:
                 raise Refusal("busy", f"{MOST_ENTRIES} targets are held already")
-            wait = {"accepted": self._claim_s, "done": inf}.get(outcome, hold_s)
-            self._entries[target] = _Entry(owner, outcome == "done", now + wait, now)
+            wait = self._claim_s if outcome == "accepted" else hold_s
+            self._entries[target] = _Entry(owner, now + wait)
             return "removed"
-        self._entries.pop(target, None)
         return "restored"

@@ -74,13 +74,11 @@ class Choice:
         frame: What they are expressed in.
         targets: In the picks' order.
         withheld: How many picks are none, by reason.
-        seen: The ids of all picks.
     """
 
     frame: str
     targets: tuple[Target, ...]
     withheld: Mapping[Reason, int]
-    seen: tuple[int, ...]
 
 
 class _Table:
@@ -119,7 +117,7 @@ class Filter:
         table = _Table(picks)
         with np.errstate(all="ignore"):
             left, withheld = self._sieve(table)
-            return Choice(table.frame, _targets(table, left), withheld, tuple(table.id.tolist()))
+            return Choice(table.frame, _targets(table, left), withheld)
 
     def _sieve(self, table: _Table) -> tuple[NDArray[np.intp], dict[Reason, int]]:
         bad: dict[Reason, Bools] = {

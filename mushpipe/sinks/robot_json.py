@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, PrivateAttr, field_validator, model_validator
 
-from mushpipe import GraphPath, Picks, RgbdFrame, RunInfo, Sink, SinkPath, Trace
+from mushpipe import GraphPath, Header, Picks, RunInfo, Sink, SinkPath, Trace
 from mushpipe.core.errors import EXIT_INTERRUPTED, EXIT_NO_DEVICE, EXIT_OK, UsageError
 from mushpipe.robot.abb import AbbSession
 from mushpipe.robot.clock import Clock, Lateness, Placer
@@ -24,12 +24,14 @@ from mushpipe.robot.server import Listener, Opener, Options, RobotServer
 from mushpipe.robot.session import JsonSession
 from mushpipe.robot.targets import Filter, Workspace
 from mushpipe.robot.transcript import Transcript
-from mushpipe.sources.realsense_frames import CLOCK_TOPIC, Domain
 from mushpipe.sources.realsense_frames import Clock as SensorClock
+from mushpipe.sources.realsense_frames import Domain, clock_of
 
 logger = logging.getLogger("mushpipe")
-# Stamps further from the host's clock than this are in a clock of their own, if nobody says more.
+# Stamps further from the host's clock than this are in a clock of their own, if nobody says more,
 SAME_CLOCK_NS = 2 * 10**9
+# or late by so much at most, if earlier ones were in the host's.
+LONGEST_WAIT_NS = 60 * 10**9
 
 
 class RobotJsonSink(Sink):
@@ -89,6 +91,7 @@ class RobotJsonSink(Sink):
     _ending: Ending = PrivateAttr("failed")
     _live: bool = PrivateAttr(False)
     _warned: bool = PrivateAttr(False)
+    _shared: bool = PrivateAttr(False)  # whether a stamp was seen to be on the host's clock
 
     @field_validator("bind")
     @classmethod
@@ -213,9 +216,8 @@ class RobotJsonSink(Sink):
             played -= (time.perf_counter_ns() - trace.left_ns) / 1e9
         if not self._live or self._placer is None:
             return played
-        sensor = trace.frame.attached.get(CLOCK_TOPIC)
-        sensor = sensor if isinstance(sensor, SensorClock) else None
-        shared = _is_of_host(trace.frame, sensor)
+        sensor = clock_of(trace.frame)
+        shared = self._is_of_host(header, sensor)
         stamp_ns = min(header.stamp_ns, header.arrival_ns) if shared else header.arrival_ns
         placed = self._placer.place(stamp_ns)
         if placed is None:
@@ -224,9 +226,19 @@ class RobotJsonSink(Sink):
                 logger.warning("the camera's time stamps are not of this host: robots get nothing")
             return float("-inf")
         taken = min(placed, played)
-        if sensor is not None and not shared:
-            taken -= self._lateness.of(sensor.time_ms[0], header.stamp_ns, taken)
+        if not shared:
+            own_ms = header.stamp_ns / 1e6 if sensor is None else float(sensor.time_ms[0])
+            # as it left the source: where it was placed, it may be too early by a jump
+            taken -= self._lateness.of(own_ms, header.stamp_ns, played)
         return taken - self.sensor_latency_ms / 1000
+
+    def _is_of_host(self, header: Header, sensor: SensorClock | None) -> bool:
+        """Return whether a frame's stamp is on the clock on which it arrived."""
+        if sensor is not None:
+            return bool(sensor.domain[0] != Domain.HARDWARE)
+        wait_ns = header.arrival_ns - header.stamp_ns
+        self._shared |= 0 <= wait_ns <= SAME_CLOCK_NS
+        return self._shared and 0 <= wait_ns <= LONGEST_WAIT_NS
 
     def finish(self, summary: Mapping[str, Any]) -> None:
         """Note how the run ended, for the robots' last word."""
@@ -246,13 +258,6 @@ class RobotJsonSink(Sink):
         if self._transcript is not None:
             self._transcript.close()
             self._transcript = None
-
-
-def _is_of_host(frame: RgbdFrame, sensor: SensorClock | None) -> bool:
-    """Return whether a frame's stamp is on the clock on which it arrived."""
-    if sensor is not None:
-        return bool(sensor.domain[0] != Domain.HARDWARE)
-    return 0 <= frame.header.arrival_ns - frame.header.stamp_ns <= SAME_CLOCK_NS
 
 
 def _is_loopback(address: str) -> bool:

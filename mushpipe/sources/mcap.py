@@ -92,7 +92,8 @@ class McapSource(RecordedSource, ReplaySource):
         while turn < self.loop or self.loop == 0:
             first = last = None
             player.camera, player.frames = camera, 0
-            messages = reader.messages(player.wanted(), start_ns, end_ns)
+            # mushpipe writes frames in order, whatever their stamps; ROS sorts by what it logged
+            messages = reader.messages(player.wanted(), start_ns, end_ns, player.numbered)
             for frame in player.play(messages, hold=bool(player.beside)):
                 header = frame.header
                 first, last = first or header, header

@@ -50,7 +50,8 @@ class Pairing(Generic[C, D]):
             while self._depths and self._depths[0][0] < stamp - self.tolerance_ns:
                 self._depths.popleft()
                 self.depth_alone += 1
-            near = [d for d in self._depths if d[0] <= stamp + self.tolerance_ns]
+            # where stamps went back, any of them may be too late or too early
+            near = [d for d in self._depths if abs(d[0] - stamp) <= self.tolerance_ns]
             if not (last or self._impatient() or self._is_final(stamp, near)):
                 return
             best = self._nearest(stamp, near)

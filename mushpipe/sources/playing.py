@@ -27,6 +27,7 @@ from mushpipe.sources.topics import Topics, is_beside, says_aligned
 T = TypeVar("T")
 logger = logging.getLogger("mushpipe")
 FARTHEST_M = 30.0
+MOST_BESIDE = 256  # frames of which something waits that was recorded beside them
 NO_DEPTH = "%s has no depth: positions, distances and diameters will be missing"
 
 
@@ -154,9 +155,10 @@ class Player:
 
     def _with_beside(self, frame: RgbdFrame) -> RgbdFrame:
         place = (frame.header.stamp_ns, frame.header.sequence)
-        attached = self._found_beside.pop(place, {})
-        for passed in [each for each in self._found_beside if each < place]:
-            del self._found_beside[passed]
+        attached = self._found_beside.get(place, {})
+        # What came before it belongs to frames that are lost; stamps do not tell: they may go back.
+        while len(self._found_beside) > MOST_BESIDE or place in self._found_beside:
+            del self._found_beside[next(iter(self._found_beside))]
         return replace(frame, attached=attached) if attached else frame
 
     def calibration(self, raw: Raw, what: str = "") -> Camera | None:

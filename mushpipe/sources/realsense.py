@@ -92,6 +92,8 @@ class RealsenseSource(ReplaySource):
     _serial: str | None = PrivateAttr(None)
     _counts: Counter[str] = PrivateAttr(default_factory=Counter)
     _interrupted: threading.Event = PrivateAttr(default_factory=threading.Event)
+    _waited_s: float | None = PrivateAttr(None)  # for a lost camera, until it sends a frame
+    _quiet_s: float = PrivateAttr(0.0)
 
     @property
     def live(self) -> bool:
@@ -153,12 +155,10 @@ class RealsenseSource(ReplaySource):
         link = self._link
         maker = FrameMaker(self.filters, self.warm_up, self._counts)
         while link is not None:
+            self._quiet_s = 0.0
             try:
-                maker.begin(link)
-                for frames, arrival_ns in self._framesets(link):
-                    frame = maker.make(frames, arrival_ns)
-                    if frame is not None:
-                        yield frame
+                _begin(maker, link)
+                yield from self._played(link, maker)
                 return
             except CameraLostError as lost:
                 why = str(lost)
@@ -166,36 +166,56 @@ class RealsenseSource(ReplaySource):
                 link.stop()
             link = self._link = self._reconnect(why)
 
-    def _framesets(self, link: Link) -> Iterator[tuple[Any, int]]:
-        quiet_s = 0.0
+    def _played(self, link: Link, maker: FrameMaker) -> Iterator[RgbdFrame]:
+        """Yield frames until the link ends; a camera that sends no whole frameset is silent."""
+        quiet_s, whole = 0.0, maker.whole
         while not self._interrupted.is_set():
+            begin = time.monotonic()
             frames = link.wait()
-            if frames is not None:
-                quiet_s = 0.0
-                yield frames, time.time_ns()
-                continue
-            if link.ended():
+            if frames is None and link.ended():
                 self._counts[UNPLAYED] += link.unplayed()
                 return
-            quiet_s += POLL_MS / 1000
-            link.check(quiet_s, self.patience_s)
+            frame = maker.make(frames, time.time_ns()) if frames is not None else None
+            if maker.whole > whole:
+                quiet_s, whole = 0.0, maker.whole
+                self._is_back()
+            else:
+                quiet_s += POLL_MS / 1000 if frames is None else time.monotonic() - begin
+                self._quiet_s = quiet_s
+                if frames is None or quiet_s >= self.patience_s:
+                    link.check(quiet_s, self.patience_s)
+            if frame is not None:
+                yield frame
+
+    def _is_back(self) -> None:
+        if self._waited_s is not None:
+            self._waited_s = None
+            logger.warning("the camera is back")
 
     def _reconnect(self, why: str) -> Link | None:
-        """Wait for a lost camera, ever longer between two looks; None when interrupted."""
-        logger.warning("the camera was lost: %s; waiting for it up to %g s", why, self.reconnect_s)
-        self._counts[TIMES_LOST] += 1
-        waited_s, pause_s = 0.0, 0.5
-        while waited_s < self.reconnect_s:
+        """Wait for a lost camera, ever longer between two looks; None when interrupted.
+
+        One that is found and stays silent was not back: the time goes on.
+        """
+        if self._waited_s is None:
+            self._waited_s = 0.0
+            self._counts[TIMES_LOST] += 1
+            logger.warning(
+                "the camera was lost: %s; waiting for it up to %g s", why, self.reconnect_s
+            )
+        else:
+            self._waited_s += self._quiet_s
+        pause_s = 0.5
+        while self._waited_s < self.reconnect_s:
             if self._pause(pause_s):
                 return None
-            waited_s += pause_s
+            self._waited_s += pause_s
             pause_s = min(2 * pause_s, 5.0)
             try:
                 link = self._connect()
             except DeviceError as error:
                 logger.debug("%s", error)
             else:
-                logger.warning("the camera is back")
                 return link
         raise DeviceError(
             f"the camera was lost ({why}) and did not come back within {self.reconnect_s:g} s"
@@ -246,6 +266,16 @@ class RealsenseSource(ReplaySource):
     def _pause(self, seconds: float) -> bool:
         """Wait between two attempts; return whether to give up."""
         return self._interrupted.wait(seconds)
+
+
+def _begin(maker: FrameMaker, link: Link) -> None:
+    """Begin with a link; a camera may go while it is asked for its calibration."""
+    try:
+        maker.begin(link)
+    except RuntimeError as error:
+        if not link.live:
+            raise
+        raise CameraLostError(f"librealsense says: {error}") from error
 
 
 def _size(text: str) -> tuple[int, int]:

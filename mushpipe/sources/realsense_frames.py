@@ -10,6 +10,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import orjson
 from numpy.typing import NDArray
 
 from mushpipe.core.errors import InputError
@@ -17,6 +18,7 @@ from mushpipe.core.geometry import Camera
 from mushpipe.core.libraries import import_realsense
 from mushpipe.core.tables import Columns, column
 from mushpipe.core.types import Header, RgbdFrame
+from mushpipe.core.wire import Message
 from mushpipe.sources.images import decode_color
 from mushpipe.sources.realsense_device import camera_of
 from mushpipe.sources.realsense_link import Link
@@ -58,6 +60,15 @@ class Clock(Columns):
     domain: NDArray[np.uint8] = column(dtype=np.uint8)
 
 
+def clock_of(frame: RgbdFrame) -> Clock | None:
+    """Return what the sensor said of a frame, of a camera here or at the other end of a stream."""
+    clock = frame.attached.get(CLOCK_TOPIC)
+    if isinstance(clock, Message) and clock.schema.name == f"mushpipe.{Clock.__name__}":
+        columns = orjson.loads(clock.data)
+        return Clock(columns["number"], columns["time_ms"], columns["domain"])
+    return clock if isinstance(clock, Clock) else None
+
+
 class FrameMaker:
     """Makes frames out of framesets; numbers go on where a lost camera comes back."""
 
@@ -68,12 +79,13 @@ class FrameMaker:
             "temporal": rs.temporal_filter,
             "hole-filling": rs.hole_filling_filter,
         }
-        self._filters = [makers[name]() for name in filters]
+        self._makers = [makers[name] for name in filters]
         self._align = rs.align(rs.stream.color)
         self._warm_up = warm_up
         self._counts = counts
         self._sequence = -1
         self._last_arrival_ns = 0
+        self.whole = 0  # framesets so far that had all of their images
 
     def begin(self, link: Link) -> None:
         """Take scale and calibration from a link that was just started.
@@ -92,6 +104,7 @@ class FrameMaker:
         if self._has_depth:
             self._scale = link.profile.get_device().first_depth_sensor().get_depth_scale()
             self._gain, self._shift = _along_color_axis(streams, self._camera, self._scale)
+        self._filters = [make() for make in self._makers]  # they remember what was there before
         self._live = link.live
         self._to_skip = self._warm_up if link.live else 0
         self._numbers: dict[str, int] = {}
@@ -115,6 +128,7 @@ class FrameMaker:
         if len(arrived) < len(images) or not fresh:
             self._counts[UNPAIRED] += 1
             return None
+        self.whole += 1
         if self._to_skip:
             self._to_skip -= 1
             return None

@@ -84,7 +84,7 @@ class CameraLink:
         if not self._connected():
             raise CameraLostError("it was unplugged")
         if quiet_s >= patience_s:
-            raise CameraLostError(f"it is connected but sent no image for {patience_s:g} s")
+            raise CameraLostError(f"it is connected but sent no whole frame for {patience_s:g} s")
 
     def _connected(self) -> bool:
         try:

@@ -6,7 +6,7 @@ import json
 import signal
 import subprocess
 import sys
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +15,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
+from mcap.writer import Writer
 
 from mushpipe import Camera, Circles, DepthSource, Header, Locations, Picks, Poses, RgbdFrame
+from mushpipe.core import wire
 from mushpipe.core.document import Document
 from mushpipe.core.graph import compile_document
 from mushpipe.core.plugins import load_registry
-from mushpipe.core.recording import RecordingReader
+from mushpipe.core.recorder import RecordingWriter
+from mushpipe.core.recording import MANIFEST, RecordingReader
 from mushpipe.core.run import run
 from mushpipe.core.tables import Columns
 from mushpipe.core.truth import Truth
 from mushpipe.core.wire import decode_table
 from mushpipe.sources.mcap import McapSource
+from mushpipe.sources.realsense_frames import Clock
 from tests.io.bags import OPTICAL, PERIOD, T0, drain, play, rgbd, write_bag
 from tests.io.values import make_circles, make_frame, make_picks, no_picks, record, trace_of
 
@@ -289,3 +293,49 @@ def test_a_killed_writer_loses_at_most_its_open_chunk(tmp_path: Path) -> None:
         assert frame.camera == Camera(640, 480, 617, 617, 320, 240)
     assert "it breaks off: the recorder did not close it" in str(error)
     assert "mushpipe.manifest" in RecordingReader(path).index().metadata
+
+
+@pytest.mark.parametrize("missing", ["schemas", "counts"])
+def test_a_summary_may_leave_things_out(tmp_path: Path, missing: str) -> None:
+    """As the specification of MCAP allows: then the file itself is read for them."""
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, repeat_schemas=missing != "schemas")
+        writer.start()
+        channels: dict[str, int] = {}
+        for number in range(3):
+            frame = make_frame(number)
+            for topic, message in (
+                (wire.COLOR_TOPIC, wire.encode_color(frame)),
+                (wire.DEPTH_TOPIC, wire.encode_depth(frame)),
+            ):
+                if topic not in channels:
+                    known = message.schema
+                    schema = writer.register_schema(known.name, known.encoding, known.data)
+                    encoding, metadata = known.message_encoding, dict(message.metadata)
+                    channels[topic] = writer.register_channel(topic, encoding, schema, metadata)
+                stamp = frame.header.stamp_ns
+                writer.add_message(channels[topic], stamp, message.data, stamp, number)
+        if missing == "counts":
+            writer._Writer__statistics.channel_message_counts.clear()
+        writer.finish()
+    frames = list(McapSource(path=path).frames())
+    assert [frame.depth is not None for frame in frames] == [True] * 3
+
+
+def test_stamps_that_go_back_neither_turn_frames_round_nor_lose_what_is_beside_them(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "a.mcap"
+    writer = RecordingWriter(path, {MANIFEST: {"json": "{}"}})
+    for number, shift in enumerate([0, 0, 0, -30, -30, -30]):
+        frame = make_frame(number)
+        stamp = frame.header.stamp_ns + shift * 33_000_000
+        header = replace(frame.header, stamp_ns=stamp, arrival_ns=stamp)
+        clock = Clock(np.array([number]), np.array([1.0]), np.array([0]))
+        writer.frame(replace(frame, header=header, attached={"/clock": clock}))
+    writer.close()
+    frames = list(McapSource(path=path).frames())
+    assert [frame.header.sequence for frame in frames] == [10, 11, 12, 13, 14, 15]
+    numbers = [json.loads(f.attached["/clock"].data)["number"] for f in frames]
+    assert numbers == [[i] for i in range(6)]

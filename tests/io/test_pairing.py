@@ -183,3 +183,17 @@ def test_every_colour_comes_out_once_in_order_and_every_depth_is_accounted_for(
     if all(b - a > 2 * tolerance for a, b in pairwise(colors)):
         # No two colours compete for a depth, so each that can have one gets one.
         assert {color for color, _ in paired} == brute_force(colors, depths, tolerance)
+
+
+@given(st.lists(st.tuples(st.booleans(), st.integers(0, 60)), max_size=60), st.integers(0, 5))
+def test_no_pair_is_further_apart_than_the_tolerance(
+    items: list[tuple[bool, int]], tolerance: int
+) -> None:
+    """Whatever order stamps come in."""
+    pairing: Pairing[int, int] = Pairing(tolerance)
+    pairs = []
+    for is_color, stamp in items:
+        pairs += (pairing.add_color if is_color else pairing.add_depth)(stamp, stamp)
+    pairs += pairing.finish()
+    assert all(depth is None or abs(color - depth) <= tolerance for color, depth in pairs)
+    assert [color for color, _ in pairs] == [stamp for is_color, stamp in items if is_color]

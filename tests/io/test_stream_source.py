@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import pty
+import subprocess
+import sys
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -23,7 +25,10 @@ from mushpipe.core.errors import (
 )
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.recording import MANIFEST
+from mushpipe.core.stage import STDIO
 from mushpipe.sources import stream as module
+from mushpipe.sources.mcap import McapSource
+from mushpipe.sources.realsense_frames import Clock
 from mushpipe.sources.stream import StreamSource
 from tests.cli.test_record import CAMERA, picture
 from tests.core.lab import Lab, held, soon
@@ -207,3 +212,24 @@ def test_an_interrupted_source_stops_waiting(tmp_path: Path) -> None:
     assert list(source.frames()) == []
     os.close(read)
     os.close(write)
+
+
+def test_a_stream_that_was_saved_is_a_recording(tmp_path: Path) -> None:
+    """Streams have no index of their metadata: what they are can only be read."""
+    path = tmp_path / "saved.mcap"
+    code = "import sys; from tests.io.test_stream_source import send; send()"
+    with path.open("wb") as file:
+        subprocess.run([sys.executable, "-c", code], stdout=file, check=True)
+    saved = list(McapSource(path=path).frames())
+    sent = list(opened(path).frames())
+    assert [f.header.sequence for f in saved] == [f.header.sequence for f in sent] == [0, 1, 5]
+    assert [list(f.attached) for f in saved] == [list(f.attached) for f in sent] == [["/clock"]] * 3
+
+
+def send() -> None:
+    writer = RecordingWriter(STDIO, {MANIFEST: {"json": "{}"}})
+    for number in (0, 1, 5):
+        header = Header(10**18 + number * 33_000_000, number, "c")
+        beside = Clock(np.array([number]), np.array([1.0]), np.array([0]))
+        writer.frame(RgbdFrame(header, picture(0)[0], attached={"/clock": beside}))
+    writer.close()

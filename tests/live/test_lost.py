@@ -5,13 +5,14 @@ from __future__ import annotations
 import logging
 import platform
 import threading
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 
 from mushpipe.core.errors import EXIT_INTERRUPTED, EXIT_NO_DEVICE, DeviceError
-from mushpipe.sources import realsense_device
+from mushpipe.sources import realsense_device, realsense_frames
 from mushpipe.sources.realsense import TIMES_LOST, RealsenseSource
 from mushpipe.sources.realsense_device import cameras_on_usb, no_camera
 from mushpipe.sources.realsense_frames import AWAY
@@ -117,7 +118,8 @@ def test_a_silent_camera_is_started_again(caplog):
         assert next(frames).header.sequence == 1
     source.close()
     assert caplog.messages[0] == (
-        "the camera was lost: it is connected but sent no image for 1 s; waiting for it up to 60 s"
+        "the camera was lost: it is connected but sent no whole frame for 1 s; waiting for it up to "
+        "60 s"
     )
 
 
@@ -125,6 +127,75 @@ def live_lab(lab: Lab, rig: Rig) -> str:
     lab.registry.source("camera", rig.source_class())
     settings = rig.settings() | {"use": "camera"}
     return f"mushpipe: 1\nsource: {settings}\nsinks: {{out: {{use: collect}}}}\n"
+
+
+@pytest.mark.parametrize("missing", ["color", "depth"])
+def test_a_camera_of_which_one_sensor_sends_nothing_is_lost(missing):
+    """Neither half-dead nor started in vain for ever: the time to come back goes on meanwhile."""
+    rig = Rig()
+    source, frames = started(rig, patience_s=1.0, reconnect_s=2.0)
+    ended = threading.Event()
+
+    def pump() -> None:
+        number = 0
+        while not ended.wait(0.03):
+            number += 1
+            images = rig.images(number)
+            del images[missing]
+            with suppress(RuntimeError):  # between two starts
+                rig.feed(number, images)
+
+    thread = threading.Thread(target=pump)
+    thread.start()
+    with pytest.raises(DeviceError, match=r"sent no whole frame for 1 s.* within 2 s"):
+        next(frames)
+    ended.set()
+    thread.join()
+    assert source.counts()[TIMES_LOST] == 1
+    source.close()
+
+
+def test_depth_from_before_a_loss_fills_no_holes():
+    rig = Rig()
+    source = rig.source(filters=["temporal"])
+    source.open()
+    frames = source.frames()
+    for number in range(10):
+        rig.feed(number)
+        next(frames)
+    rig.context.plugged = False
+    holes = rig.images(0)
+    holes["depth"][:] = 0
+
+    def plug() -> None:
+        rig.context.plugged = True
+
+    rig.on_pause, rig.on_start = plug, lambda: rig.feed(0, holes)
+    assert not next(frames).depth.any()
+    source.close()
+
+
+def test_a_camera_that_goes_while_it_is_asked_for_its_calibration_is_lost(monkeypatch):
+    rig = Rig()
+    source, frames = started(rig)
+    calls, real = [], realsense_frames._along_color_axis
+
+    def flaky(*arguments):
+        calls.append(arguments)
+        if len(calls) == 1:
+            raise RuntimeError("hwmon command failed")
+        return real(*arguments)
+
+    monkeypatch.setattr(realsense_frames, "_along_color_axis", flaky)
+    rig.context.plugged = False
+
+    def plug() -> None:
+        rig.context.plugged = True
+
+    rig.on_pause, rig.on_start = plug, lambda: rig.feed(0)
+    assert next(frames).header.sequence == 1
+    assert len(calls) == 2
+    source.close()
 
 
 @pytest.mark.parametrize("away", [False, True])

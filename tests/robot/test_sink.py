@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from mushpipe import Header, RgbdFrame, RunInfo, Trace
+from mushpipe.core import wire
 from mushpipe.core.errors import UsageError
 from mushpipe.robot.client import RobotClient
 from mushpipe.robot.clock import STEP_S, Placer
@@ -207,6 +208,59 @@ def test_a_picture_that_waited_in_the_camera_is_old(sink: RobotJsonSink, domain:
         assert sink._server
         age = sink._server.hub.age_ms(clock.now)
         assert age == pytest.approx(1000 * waited, abs=2)
+
+
+def test_the_cameras_clock_counts_at_the_other_end_of_a_stream(sink: RobotJsonSink) -> None:
+    """Slow by a second against the host, which is less than what tells one clock from another."""
+    sink.open(LIVE)
+    clock = sink._clock
+    assert isinstance(clock, FakeClock)
+    for pause, slow, waited in ((1, 0.0, 0.0), (5000, 0.5, 0.0), (5000, 1.0, 0.0), (1, 1.0, 0.3)):
+        clock.now += pause
+        stamp = clock.wall_ns() - round(slow * 1e9)
+        clock.now += waited
+        header = frame_at(stamp, clock.wall_ns()).header
+        (beside,) = sensor_at(stamp - EPOCH_NS, Domain.HARDWARE).values()
+        (sent,) = wire.encoder_of(SensorClock)(beside, header)
+        frame = replace(frame_at(stamp, clock.wall_ns()), attached={CLOCK_TOPIC: sent})
+        sink.consume(make_picks(), Trace(frame, {}, {}, NOW_NS))
+        assert sink._server
+        assert sink._server.hub.age_ms(clock.now) == pytest.approx(1000 * waited, abs=2)
+
+
+@pytest.mark.parametrize("jump", [-8.0, -2.0, -0.3, 2.0])
+def test_a_clock_that_is_set_makes_targets_old_for_seconds_alone(
+    sink: RobotJsonSink, jump: float
+) -> None:
+    sink.open(LIVE)
+    clock = sink._clock
+    assert isinstance(clock, FakeClock)
+    own, ages_ms, first = 0.0, [], clock.wall_ns()
+    for number in range(300):  # a minute
+        clock.now += 0.2
+        own += 0.2
+        clock.offset_s = jump if number > 50 else 0.0
+        stamp = first + round(own * 1e9)
+        attached = sensor_at(round(own * 1e9), Domain.HARDWARE)
+        frame = replace(frame_at(stamp, clock.wall_ns()), attached=attached)
+        sink.consume(make_picks(), Trace(frame, {}, {}, NOW_NS))
+        assert sink._server
+        ages_ms.append(sink._server.hub.age_ms(clock.now))
+    assert max(ages_ms[:50] + ages_ms[120:]) <= 10
+
+
+@pytest.mark.parametrize("off_s", [0.0, 3600.0])
+def test_a_picture_of_a_camera_that_says_nothing_of_its_clock_is_old_where_it_waited(
+    sink: RobotJsonSink, off_s: float
+) -> None:
+    sink.open(LIVE)
+    clock = sink._clock
+    assert isinstance(clock, FakeClock)
+    for waited in (0.0, 0.3, 1.9, 2.5, 6.0):
+        clock.now += 10
+        stamp = clock.wall_ns() - round(off_s * 1e9)
+        clock.now += waited
+        assert ages(sink, stamp, clock.wall_ns()) == pytest.approx(1000 * waited, abs=10)
 
 
 def test_a_frame_whose_age_nobody_knows_is_stale(

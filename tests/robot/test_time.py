@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import socket
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,10 +11,14 @@ from hypothesis import strategies as st
 from mushpipe.robot.clock import MEMORY_S, TOLERANCE_S, Clock, Lateness, Placer
 from mushpipe.robot.connection import Connection, Limits
 from mushpipe.robot.hub import Ending, Hub, Settings
-from mushpipe.robot.ledger import FORGET_S, Ledger
+from mushpipe.robot.ledger import Ledger
 from mushpipe.robot.messages import Refusal
 from mushpipe.robot.session import Outgoing
 from tests.robot.scene import FakeClock, choice
+
+
+def hidden(ledger: Ledger) -> set[int]:
+    return {target for target in range(10) if ledger.hides(target)}
 
 
 def test_a_stamp_is_placed_where_it_was_taken() -> None:
@@ -157,47 +160,36 @@ def test_an_accepted_target_comes_back_when_nothing_is_heard() -> None:
     ledger = Ledger(claim_s=60)
     assert ledger.apply("a", 1, "accepted", 0, visible=True, now=0) == "removed"
     ledger.settle(59)
-    assert ledger.hidden() == {1}
+    assert hidden(ledger) == {1}
     assert ledger.apply("a", 1, "accepted", 0, visible=True, now=59) == "removed"
     ledger.settle(100)
-    assert ledger.hidden() == {1}
+    assert hidden(ledger) == {1}
     version = ledger.version
     ledger.settle(119)
-    assert ledger.hidden() == set()
+    assert hidden(ledger) == set()
     assert ledger.version != version
 
 
-def test_what_is_done_stays_away_while_it_is_seen_and_is_forgotten_later() -> None:
+def test_what_is_done_stays_away_for_good() -> None:
     ledger = Ledger()
     ledger.apply("a", 1, "done", 0, visible=True, now=0)
-    ledger.see([1, 2], now=1e6)
-    ledger.settle(1e6 + FORGET_S - 1)
-    assert ledger.hidden() == {1}
-    ledger.settle(1e6 + FORGET_S)
-    assert ledger.hidden() == set()
+    ledger.settle(1e9)
+    assert hidden(ledger) == {1}
+    assert ledger.apply("a", 1, "failed", 0, visible=True, now=1e9) == "removed"
+    with pytest.raises(Refusal, match="held by another robot"):
+        ledger.apply("b", 1, "accepted", 0, visible=True, now=1e9)
 
 
 def test_a_target_can_be_kept_away_for_a_while() -> None:
     ledger = Ledger()
     assert ledger.apply("a", 1, "rejected", 5, visible=True, now=0) == "removed"
-    assert ledger.apply("a", 2, "failed", 2 * FORGET_S, visible=True, now=0) == "removed"
+    assert ledger.apply("a", 2, "failed", 1200, visible=True, now=0) == "removed"
     ledger.settle(5)
-    assert ledger.hidden() == {2}
-    ledger.settle(2 * FORGET_S - 1)  # out of sight all the time
-    assert ledger.hidden() == {2}
-    ledger.settle(2 * FORGET_S)
-    assert ledger.hidden() == set()
-
-
-def test_a_picked_mushroom_that_is_seen_and_withheld_is_not_forgotten() -> None:
-    clock = FakeClock()
-    hub, _ = hub_on(clock)
-    hub.ledger.apply("a", 1, "done", 0, visible=True, now=clock.now)
-    for _ in range(3):
-        clock.now += 0.7 * FORGET_S
-        hub.publish(choice(3, source=np.full(3, 2)), 1, 1, clock.now)  # a guess
-        hub.tick(clock.now)
-    assert hub.ledger.hidden() == {1}
+    assert hidden(ledger) == {2}
+    ledger.settle(1200 - 1)  # out of sight all the time
+    assert hidden(ledger) == {2}
+    ledger.settle(1200)
+    assert hidden(ledger) == set()
 
 
 @given(
