@@ -204,6 +204,10 @@ class Connection:
             self._progress = now
         return True
 
+    def silent_s(self, now: float) -> float:
+        """Return for how long it has been connected without a hello, 0 once it said it."""
+        return 0.0 if self.session.ready else now - self._opened
+
     def _check(self, now: float) -> None:
         """Cut off a client that is too slow in any way."""
         limits = self._limits
@@ -212,7 +216,7 @@ class Connection:
                 self.abort("it does not read")
         elif self._eof:
             return
-        elif not self.session.ready and now - self._opened > limits.hello_s:
+        elif self.silent_s(now) > limits.hello_s:
             self._refuse("no hello came in time", now)
         elif self._in and now - self._line_begun > limits.line_s and not self.throttled:
             self._refuse("a line was begun and not ended in time", now)

@@ -22,6 +22,8 @@ logger = logging.getLogger("mushpipe")
 TICK_S = 0.25
 THROTTLED_S = 0.01
 GOODBYE_S = 0.5
+# Where there is no room, who has not said hello for so long gives his place to the next one.
+SILENT_S = 1.0
 Opener = Callable[[Hub, int], Session]
 
 
@@ -178,10 +180,20 @@ class RobotServer:
             sock, session, number, self._options.limits, self._observe, self.hub.clock
         )
         if len(self._clients) >= self._options.max_clients:
-            self._turn_away(client)
-            return
+            away = self._silent() or client
+            self._turn_away(away)
+            if away is client:
+                return
+            self._unregister(away)
+            del self._clients[away.number]
         self._clients[number] = client
         self._selector.register(sock, selectors.EVENT_READ, client)
+
+    def _silent(self) -> Connection | None:
+        """Return the client that has waited longest with its hello, and is to make room."""
+        now = self.hub.clock.monotonic()
+        slow = [c for c in self._clients.values() if c.silent_s(now) > SILENT_S]
+        return max(slow, key=lambda c: c.silent_s(now), default=None)
 
     def _turn_away(self, client: Connection) -> None:
         now = self.hub.clock.monotonic()

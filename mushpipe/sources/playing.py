@@ -100,6 +100,7 @@ class Player:
         self._factories = (ProtobufDecoders(), Ros2Decoders())
         self._calibrated = ""  # frame of the calibration
         self._judged = False  # whether there was depth to be judged
+        self._warned = False  # that a lens is left out
         self._found_beside: dict[tuple[int, int], dict[str, wire.Message]] = {}
 
     def wanted(self) -> set[str]:
@@ -164,17 +165,31 @@ class Player:
     def calibration(self, raw: Raw, what: str = "") -> Camera | None:
         """Decode a calibration, which holds from now on, also where it says that there is none.
 
-        One that cannot be decoded changes nothing, and is counted where ``what`` says as what.
+        After one that cannot be decoded none is known; it is counted where ``what`` says as what.
         """
         name = self.topics.color.split("/")
         rectified = any(part.startswith("image_rect") for part in name)  # as ROS calls them
 
         def decode(message: Any, raw: Raw) -> Camera | None:
             self._calibrated = _stamp(message, raw)[1]
-            self.camera = decode_camera(message, rectified)
-            return self.camera
+            if "image_rect_raw" in name and any(getattr(message, "d", None) or message.D):
+                self._warn_rectified()  # realsense2_camera's name, also where it rectified nothing
+            return decode_camera(message, rectified)
 
-        return self._decode(raw, decode, what)
+        self.camera = self._decode(raw, decode, what)
+        return self.camera
+
+    def _warn_rectified(self) -> None:
+        """Say, once, that a lens is left out."""
+        if not self._warned:
+            self._warned = True
+            logger.warning(
+                "%s: %s is called rectified, so the distortion that its calibration states is not "
+                "applied; if the images are as the lens made them, positions near their corners "
+                "are off by some mm",
+                self.name,
+                self.topics.color,
+            )
 
     def _decode(
         self, raw: Raw, decode: Callable[[Any, Raw], T | None], what: str = "images"

@@ -232,3 +232,23 @@ def test_a_camera_has_finite_numbers(value: float) -> None:
         McapSource(path="a.mcap", camera={"fx": value, "fy": 600, "cx": 3, "cy": 2})
     with pytest.raises(ValueError, match="finite"):
         Camera(WIDTH, HEIGHT, FX, FY, value, CY)
+
+
+def test_after_a_calibration_that_cannot_be_decoded_none_is_known(tmp_path: Path) -> None:
+    later = info_at(1, model="equidistant", d=(0.1, 0.2, 0.3, 0.4))
+    path = write_bag(tmp_path, [info_at(0), COLORS[0], later, *COLORS[1:]])
+    frames, error = drain(McapSource(path=path))
+    assert "equidistant" in str(error)
+    assert [frame.camera for frame in frames] == [CALIBRATED, None, None]
+
+
+def test_a_lens_that_is_left_out_for_the_name_of_its_images_is_told_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As realsense2_camera calls the colour images of a D405."""
+    topic = "/camera/camera/color/image_rect_raw"
+    colors = [(topic, at, message) for _, at, message in COLORS]
+    info = info_at(0, d=(0.1, 0.0, 0.0, 0.0, 0.0))
+    found = play(write_bag(tmp_path, [info, *colors]))
+    assert [frame.camera.model for frame in found if frame.camera] == ["none"] * 3
+    assert caplog.text.count("the distortion that its calibration states is not applied") == 1

@@ -118,8 +118,8 @@ def test_a_silent_camera_is_started_again(caplog):
         assert next(frames).header.sequence == 1
     source.close()
     assert caplog.messages[0] == (
-        "the camera was lost: it is connected but sent no whole frame for 1 s; waiting for it up to "
-        "60 s"
+        "the camera was lost: it is connected but sent no whole frame for 1 s; waiting for it "
+        "up to 60 s"
     )
 
 

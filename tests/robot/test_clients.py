@@ -180,6 +180,16 @@ def test_too_many_clients() -> None:
             again.greet()
 
 
+def test_who_says_nothing_keeps_nobody_out() -> None:
+    with bench(max_clients=2) as b, Peer(b.port) as one, Peer(b.port) as silent:
+        one.greet()
+        b.advance(1.5)
+        with Peer(b.port) as two:
+            two.greet()
+            assert silent.rest()[-1]["code"] == "too_many_clients"
+            assert one.ask("ping", id=1)["op"] == "pong"
+
+
 def test_a_client_that_talks_too_fast_waits_and_nobody_else() -> None:
     with bench(Limits(lines_per_s=10)) as b, Peer(b.port) as fast, Peer(b.port) as calm:
         fast.greet()
