@@ -3,10 +3,11 @@
 This module is what a plugin author needs.
 """
 
-from mushpipe.core.errors import InputError, MushpipeError
+from mushpipe.core.errors import InputError, MushpipeError, UsageError
 from mushpipe.core.geometry import Camera, quaternion_from_axis
+from mushpipe.core.paths import GraphPath, SinkPath
 from mushpipe.core.plugins import Registry, hookimpl
-from mushpipe.core.stage import GraphPath, ReplaySource, RunInfo, Sink, SinkPath, Source, Stage
+from mushpipe.core.stage import ReplaySource, RunInfo, Sink, Source, Stage
 from mushpipe.core.tables import (
     Circles,
     Columns,
@@ -42,6 +43,7 @@ __all__ = [
     "Source",
     "Stage",
     "Trace",
+    "UsageError",
     "column",
     "hookimpl",
     "quaternion_from_axis",

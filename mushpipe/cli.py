@@ -132,8 +132,10 @@ def validate(
     import logging
     from dataclasses import asdict
 
+    from mushpipe.console import set_up_logging
     from mushpipe.core.errors import GraphError
 
+    set_up_logging(False)
     try:
         plan = _compile(graph, set_ or [], source)
     except GraphError as error:
@@ -148,7 +150,10 @@ def validate(
         warnings = [*plan.warnings, *missing]
         _out(json.dumps({"problems": [], "warnings": warnings, "graph": plan.resolved()}))
     else:
-        _out(f"{graph}: {len(plan.stages)} stages, {len(plan.sinks)} sinks, no faults")
+        counts = {"stage": len(plan.stages), "sink": len(plan.sinks)}
+        warnings = {"warning": number} if (number := len(plan.warnings) + len(missing)) else {}
+        parts = [f"{n} {name}{'' if n == 1 else 's'}" for name, n in (counts | warnings).items()]
+        _out(f"{graph}: {', '.join(parts[:2])}, no faults{''.join(f', {p}' for p in parts[2:])}")
 
 
 @app.command()

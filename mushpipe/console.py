@@ -146,4 +146,6 @@ def show_report(report: RunReport) -> None:
     if not report.balanced():
         stderr.print("the balance does not close: frames were lost unaccounted", style="bold red")
     for path in report.capsules:
-        stderr.print(f"the failing frame is saved: mushpipe run {path} repeats the failure")
+        stderr.print(
+            f"the failing frame is saved: mushpipe run {path} repeats the failure, -v says where"
+        )

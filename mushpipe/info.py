@@ -119,7 +119,8 @@ def _describe_class(kind: Kind, name: str, plugin: type[Plugin]) -> str:
         for port in ports.inputs
     ]
     outputs = [output.__name__ for output in ports.outputs]
-    lines = [f"{kind} {name}", "", inspect.getdoc(plugin) or "", ""]
+    about = inspect.cleandoc(plugin.__doc__ or "no description")  # not that of its base
+    lines = [f"{kind} {name}", "", about, ""]
     lines.append(f"inputs   {', '.join(inputs) or 'none'}")
     lines.append(f"outputs  {', '.join(outputs) or 'none'}")
     rows = settings_rows(plugin)
@@ -158,6 +159,8 @@ def _type(schema: dict[str, Any]) -> str:
         return " | ".join(_type(option) for option in schema["anyOf"])
     if "prefixItems" in schema:
         return f"[{', '.join(_type(item) for item in schema['prefixItems'])}]"
+    if schema.get("type") == "array" and schema.get("items"):
+        return f"list of {_type(schema['items'])}"
     if "$ref" in schema:
         return str(schema["$ref"].rpartition("/")[2])
     bounds = [f" {sign} {schema[key]:g}" for key, sign in _BOUNDS.items() if key in schema]

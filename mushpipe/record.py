@@ -57,7 +57,7 @@ def record(
     """Record a source until it ends or Ctrl-C; what cannot be kept is counted and told."""
     from mushpipe.console import execute, set_up_logging
     from mushpipe.core.errors import UsageError
-    from mushpipe.core.stage import STDIO
+    from mushpipe.core.paths import STDIO
 
     set_up_logging(False)
     limits = (("max_frames", "frames", frames), ("max_seconds", "duration", duration))

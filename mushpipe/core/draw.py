@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 from mushpipe.core.plan import Node, Plan
+from mushpipe.core.plugins import in_file
 from mushpipe.core.types import Trace
 
 _SHAPES = {"source": ("([", "])"), "stage": ("[", "]"), "sink": ("[/", "/]")}
@@ -28,7 +30,8 @@ def _edges(plan: Plan) -> Iterator[tuple[str, str, str]]:
 
 def _text(plan: Plan, node: Node) -> tuple[str, str]:
     delivery = f", {plan.delivery(node)}" if node.kind == "sink" else ""
-    return node.name, f"{node.use}{delivery}"
+    use = Path(node.use).name if in_file(node.use) else node.use  # alike in every folder
+    return node.name, f"{use}{delivery}"
 
 
 def mermaid(plan: Plan) -> str:

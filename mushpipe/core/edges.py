@@ -109,6 +109,8 @@ def timed(frames: Iterator[RgbdFrame], durations: Durations) -> Iterator[RgbdFra
     """Yield frames, noting how long the source takes for each."""
     begin = time.perf_counter_ns()
     for frame in frames:
+        if not isinstance(frame, RgbdFrame):
+            raise TypeError(f"it yielded {type(frame).__name__}, expected RgbdFrame")
         durations.add(time.perf_counter_ns() - begin)
         yield frame
         begin = time.perf_counter_ns()

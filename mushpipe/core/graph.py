@@ -15,7 +15,7 @@ from mushpipe.core.errors import GraphError, PluginError, Problem, suggest
 from mushpipe.core.overrides import apply_override, not_utf8
 from mushpipe.core.plan import Node, Plan
 from mushpipe.core.plugins import Registry
-from mushpipe.core.stage import WORDS, Kind, Plugin, Source, ports_of, settings_of
+from mushpipe.core.stage import OF_SOURCE, WORDS, Kind, Plugin, Source, ports_of, settings_of
 from mushpipe.core.wire import RESULT_PREFIX, TIMING_TOPIC, TOTAL
 from mushpipe.core.wiring import wire
 
@@ -201,7 +201,7 @@ def _node(
     except PluginError as error:
         problems.append(document.problem((*at, "use"), str(error)))
         # every source gives the same: what is below it can be looked at without
-        return Node("source", kind, use, Source(), ports_of(Source)) if kind == "source" else None
+        return Node("source", kind, use, Source(), OF_SOURCE) if kind == "source" else None
     if (*at, "use") in document.overrides:
         settings = _drop_foreign(document, at, use, plugin_class, settings)
         inputs = {k: v for k, v in inputs.items() if k in {port.name for port in ports.inputs}}

@@ -28,6 +28,7 @@ from mushpipe.core.stage import Kind, Plugin, kind_of
 logger = logging.getLogger("mushpipe")
 
 GROUP = "mushpipe"
+_MORE = "\n\nFor further information visit"  # pydantic's pages, in each of its errors
 hookspec = pluggy.HookspecMarker(GROUP)
 hookimpl = pluggy.HookimplMarker(GROUP)
 
@@ -204,7 +205,7 @@ def _owner(point: EntryPoint) -> tuple[str, str]:
 
 
 def _brief(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}"
+    return f"{type(error).__name__}: {str(error).partition(_MORE)[0]}"
 
 
 def _import(target: str) -> Any:

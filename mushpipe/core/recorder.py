@@ -15,7 +15,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from mushpipe.core import wire
 from mushpipe.core.errors import MushpipeError, UsageError
 from mushpipe.core.geometry import Camera
-from mushpipe.core.stage import STDIO
+from mushpipe.core.paths import STDIO
 from mushpipe.core.types import Header, RgbdFrame
 
 

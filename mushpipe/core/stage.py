@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import os
-import re
 import typing
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from inspect import Parameter, signature
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, ClassVar, Literal, Self, get_args
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo
-from pydantic.fields import FieldInfo
+from pydantic import BaseModel, ConfigDict, Field
 
 from mushpipe.core.errors import PluginError
+from mushpipe.core.paths import STDIO, is_written
 from mushpipe.core.truth import BUILT_IN
 from mushpipe.core.types import Mask, RgbdFrame
 
@@ -26,34 +24,6 @@ WORDS = ("use", "inputs", "delivery")
 # Values are recorded under the names of their types.
 _TAKEN: dict[str, type] = {t.__name__: t for t in (*BUILT_IN, Mask, RgbdFrame)}
 _METHODS: dict[Kind, str] = {"stage": "process", "source": "frames", "sink": "consume"}
-
-
-STDIO = Path("-")
-"""In place of a file: standard output."""
-
-
-def resolve_path(path: Path, info: ValidationInfo) -> Path:
-    """Return a path of a setting, relative to the graph file or to the shell; a validator."""
-    if path == STDIO:
-        return path
-    context = info.context or {}
-    from_shell = info.field_name in context.get("from_shell", ())
-    return Path(os.path.normpath(Path("" if from_shell else context.get("base", "")) / path))
-
-
-GraphPath = Annotated[Path, AfterValidator(resolve_path)]
-"""A path setting: relative to the graph file, or to the shell where the command line set it."""
-
-
-def only_recording(path: Path) -> Path:
-    """Raise ValueError where braces of a sink's path hold anything but ``recording``."""
-    if unknown := set(re.findall(r"\{[^}]*\}", str(path))) - {"{recording}"}:
-        raise ValueError(f"{', '.join(sorted(unknown))} is not known: only {{recording}} is")
-    return path
-
-
-SinkPath = Annotated[Path, AfterValidator(only_recording), AfterValidator(resolve_path)]
-"""A path that a sink writes to; {recording} in it is the name of the input."""
 
 
 @dataclass(frozen=True)
@@ -79,13 +49,6 @@ class RunInfo:
         return path
 
 
-def _is_written(setting: FieldInfo) -> bool:
-    """Whether a setting is a `SinkPath`, or that or None."""
-    alternatives = (getattr(kind, "__metadata__", ()) for kind in get_args(setting.annotation))
-    validators = (each for group in (setting.metadata, *alternatives) for each in group)
-    return any(getattr(each, "func", None) is only_recording for each in validators)
-
-
 class Plugin(BaseModel):
     """Base of all plugins: an immutable description whose fields are its settings.
 
@@ -94,10 +57,19 @@ class Plugin(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set a private attribute; anything else is a mistake of the plugin's author."""
+        if not name.startswith("_"):
+            raise AttributeError(
+                f"'{name}' cannot be set: settings are frozen; keep state in a private attribute, "
+                f"declared in the class, as '_{name}: Any = None' is"
+            )
+        super().__setattr__(name, value)
+
     def path_settings(self, written: bool) -> dict[str, Path]:
         """Return the settings that name files: of type `SinkPath`, or to be read as a model is."""
         settings, kinds = type(self).model_fields.items(), Path | str if written else Path
-        named = ((n, getattr(self, n)) for n, f in settings if _is_written(f) is written)
+        named = ((n, getattr(self, n)) for n, f in settings if is_written(f) is written)
         return {n: Path(v) for n, v in named if isinstance(v, kinds) and Path(v) != STDIO}
 
     def close(self) -> None:
@@ -214,6 +186,9 @@ class Ports:
     wants_rng: bool
 
 
+OF_SOURCE = Ports((), (RgbdFrame,), False)
+
+
 def kind_of(plugin: type) -> Kind:
     """Return which of the three kinds a class is.
 
@@ -246,7 +221,9 @@ def ports_of(plugin: type[Plugin]) -> Ports:
                 "stands beside the settings; give it another name, or an alias"
             )
     if kind_of(plugin) == "source":
-        return Ports((), (RgbdFrame,), False)
+        if plugin.frames is Source.frames:  # type: ignore[attr-defined]
+            raise PluginError(f"{plugin.__qualname__} has no method 'frames'")
+        return OF_SOURCE
     name = _METHODS[kind_of(plugin)]
     method = getattr(plugin, name, None)
     if method is None:

@@ -46,6 +46,8 @@ class Columns:
         length: int | None = None
         for name, (shape, dtype) in self._columns().items():
             array = locked(getattr(self, name), dtype)
+            if array.shape == (0,):  # an empty list, of which nothing tells the shape of a row
+                array = array.reshape(0, *shape)
             if array.shape[1:] != shape or array.ndim == 0:
                 expected = ", ".join(["N", *map(str, shape)])
                 raise ValueError(

@@ -16,7 +16,7 @@ from pydantic import (
     field_validator,
 )
 
-from mushpipe.core.stage import resolve_path
+from mushpipe.core.paths import resolve_path
 from mushpipe.core.tables import Floats
 
 UNIT_TOLERANCE = 1e-3

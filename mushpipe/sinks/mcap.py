@@ -11,9 +11,9 @@ from typing import Any, ClassVar, Literal
 from pydantic import ByteSize, Field, PrivateAttr
 
 from mushpipe import RunInfo, Sink, SinkPath, Trace
+from mushpipe.core.paths import STDIO
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.recording import MANIFEST, SUMMARY
-from mushpipe.core.stage import STDIO
 from mushpipe.sinks.messages import result_messages, timing_message
 
 

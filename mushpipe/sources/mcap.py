@@ -13,8 +13,9 @@ from pydantic import Field, PrivateAttr
 from mushpipe.core import wire
 from mushpipe.core.errors import InputError
 from mushpipe.core.geometry import Camera
+from mushpipe.core.paths import GraphPath
 from mushpipe.core.recording import GRAPH, MANIFEST, Index, RecordingReader
-from mushpipe.core.stage import GraphPath, ReplaySource
+from mushpipe.core.stage import ReplaySource
 from mushpipe.core.types import RgbdFrame
 from mushpipe.sources.playing import NO_DEPTH, Player, RecordedSource
 from mushpipe.sources.topics import choose_topics

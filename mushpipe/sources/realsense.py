@@ -14,7 +14,8 @@ from pydantic import Field, PrivateAttr
 
 from mushpipe.core.errors import DeviceError, UsageError
 from mushpipe.core.libraries import import_realsense
-from mushpipe.core.stage import GraphPath, ReplaySource
+from mushpipe.core.paths import GraphPath
+from mushpipe.core.stage import ReplaySource
 from mushpipe.core.types import RgbdFrame
 from mushpipe.sources import realsense_device as device
 from mushpipe.sources.realsense_frames import FrameMaker

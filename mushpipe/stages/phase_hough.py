@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 
-from mushpipe import Circles, InputError, Mask, RgbdFrame, Stage
-from mushpipe.core.stage import GraphPath
+from mushpipe import Circles, Mask, RgbdFrame, Stage, UsageError
+from mushpipe.core.paths import GraphPath
 from mushpipe.stages.doubling import doubled
 from mushpipe.stages.phase_blobs import blobs_of
 from mushpipe.stages.phase_decide import decide
@@ -140,10 +140,10 @@ class PhaseHough(Stage):
             learned: Circles of `cap-net`; ignored unless `use_learned`.
 
         Raises:
-            InputError: `use_learned`, and there are no circles.
+            UsageError: `use_learned`, and there are no circles.
         """
         if self.use_learned and learned is None:
-            raise InputError("use_learned needs a stage above that finds circles, such as cap-net")
+            raise UsageError("use_learned needs a stage above that finds circles, such as cap-net")
         found = self.gather(frame, mask, learned if self.use_learned else None)
         if found is None:
             return Circles(np.zeros((0, 2)), np.zeros(0), np.zeros(0))

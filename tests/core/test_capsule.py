@@ -66,7 +66,7 @@ def test_the_program_repeats_the_failure(lab: Lab, graph: str, monkeypatch, caps
     (lab.folder / "graph.yaml").write_text(graph)
     assert cli(monkeypatch, "run", "graph.yaml") == 1
     first = capsys.readouterr().err
-    assert "mushpipe run failures/failure-rich-b-2.mcap repeats the failure" in first
+    assert "mushpipe run failures/failure-rich-b-2.mcap repeats the failure, -v says where" in first
     assert cli(monkeypatch, "run", "failures/failure-rich-b-2.mcap") == 1
     error = first[first.index("error: ") :]
     assert capsys.readouterr().err.endswith(error)

@@ -168,16 +168,6 @@ def test_a_source_that_fails_to_close_does_not_hang(lab: Lab):
     assert report.processed == 1
 
 
-def test_a_source_without_frames_is_an_error(lab: Lab):
-    from mushpipe import Source
-
-    class Bare(Source): ...
-
-    lab.registry.source("bare", Bare)
-    report = lab.run(lab.chain("threshold", source="bare"))
-    assert str(report.error) == "source 'source' (bare) failed: NotImplementedError: "
-
-
 @pytest.mark.parametrize("method", ["name", "files"])
 def test_a_source_that_cannot_describe_itself(lab: Lab, method):
     def fails(self):

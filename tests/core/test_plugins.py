@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from mushpipe import Stage
-from mushpipe.core.errors import DependencyError, PluginError
+from mushpipe.core.errors import DependencyError, GraphError, PluginError
 from mushpipe.core.plugins import Registry, load_registry, register
 from tests.core.lab import Both, Frames, Invert, Lab, Threshold, cli
 
@@ -304,3 +304,39 @@ def test_names_are_sorted_and_by_kind():
     assert registry.names("source") == ["c"]
     assert registry.names("sink") == []
     assert issubclass(find(registry, "a"), Stage)
+
+
+MISTAKES = {
+    "state in a setting": (
+        "class Mine(Stage):\n    level: int = 3\n    def process(self, frame: RgbdFrame) -> Mask:\n"
+        "        self.level = 5\n        return Mask(frame.color[..., 0] > 1)\n",
+        "AttributeError: 'level' cannot be set: settings are frozen; keep state in a private",
+    ),
+    "no annotation": (
+        "class Mine(Stage):\n    level = 3\n",
+        "PydanticUserError: A non-annotated attribute was detected: `level = 3`",
+    ),
+    "not a frame": (
+        "class Mine(Source):\n    def frames(self):\n        yield 5\n",
+        "failed: TypeError: it yielded int, expected RgbdFrame",
+    ),
+    "no frames": ("class Mine(Source):\n    pass\n", "Mine has no method 'frames'"),
+}
+
+
+@pytest.mark.parametrize(("code", "message"), MISTAKES.values(), ids=MISTAKES)
+def test_mistakes_of_a_plugins_author_are_explained(lab: Lab, code: str, message: str):
+    (lab.folder / "mine.py").write_text(HEADER + "from mushpipe import Source\n" + code)
+    source = "mine.py:Mine" if "Source" in code else "frames"
+    try:
+        text = str(
+            lab.run(
+                lab.chain("mine.py:Mine", source=source)
+                if source == "frames"
+                else lab.chain("threshold", source=source)
+            ).error
+        )
+    except GraphError as error:
+        text = str(error)
+    assert message in text
+    assert "errors.pydantic.dev" not in text

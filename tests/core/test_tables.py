@@ -232,3 +232,9 @@ def test_instances():
     for bad in (labels.astype(np.int32), labels[0]):
         with pytest.raises(ValueError, match=r"^Instances\.labels is .*, expected uint16$"):
             Instances(bad)
+
+
+def test_empty_lists_are_tables_without_rows():
+    circles = Circles([], [], [])
+    assert len(circles) == 0
+    assert circles.center.shape == (0, 2)

@@ -23,9 +23,9 @@ from mushpipe.core.errors import (
     InputError,
     UsageError,
 )
+from mushpipe.core.paths import STDIO
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.recording import MANIFEST
-from mushpipe.core.stage import STDIO
 from mushpipe.sources import stream as module
 from mushpipe.sources.mcap import McapSource
 from mushpipe.sources.realsense_frames import Clock
