@@ -150,10 +150,14 @@ def validate(
         warnings = [*plan.warnings, *missing]
         _out(json.dumps({"problems": [], "warnings": warnings, "graph": plan.resolved()}))
     else:
-        counts = {"stage": len(plan.stages), "sink": len(plan.sinks)}
-        warnings = {"warning": number} if (number := len(plan.warnings) + len(missing)) else {}
-        parts = [f"{n} {name}{'' if n == 1 else 's'}" for name, n in (counts | warnings).items()]
-        _out(f"{graph}: {', '.join(parts[:2])}, no faults{''.join(f', {p}' for p in parts[2:])}")
+        number = len(plan.warnings) + len(missing)
+        counted = [f"{_count(len(plan.stages), 'stage')}, {_count(len(plan.sinks), 'sink')}"]
+        counted += ["no faults", *([_count(number, "warning")] if number else [])]
+        _out(f"{graph}: {', '.join(counted)}")
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 @app.command()
