@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field, PrivateAttr
 
-from mushpipe import GraphPath, Mask, Registry, RgbdFrame, Stage, hookimpl
-from mushpipe.core.errors import UsageError
+from mushpipe import GraphPath, Mask, Registry, RgbdFrame, Stage, UsageError, hookimpl
 
 
 class YourModel(Stage):
