@@ -143,6 +143,8 @@ class Registry:
         for other in ("stage", "source", "sink"):
             if (other, use) in self.entries:
                 text = f"'{use}' is a {other}, not a {kind}"
+        if narrowed := os.environ.get("MUSHPIPE_PLUGINS"):
+            text += f"\n    only plugins of MUSHPIPE_PLUGINS={narrowed} are loaded"
         for broken in self.broken:
             text += (
                 f"\n    it may belong to {broken.distribution} {broken.version}, "

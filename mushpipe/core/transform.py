@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -110,3 +111,10 @@ TransformSetting = Annotated[
     Transform, BeforeValidator(_read, json_schema_input_type=Transform | str)
 ]
 """A `Transform` as a setting: written out, or the name of a YAML file with the same keys."""
+
+
+def base_of(graph: Mapping[str, Any]) -> Transform | None:
+    """Return the pose of the camera in the robot's frame, where a graph gives picks in that."""
+    stated = [stage.get("T_base_camera") for stage in graph.get("stages", {}).values()]
+    known = [Transform.model_validate(each) for each in stated if each]
+    return known[-1] if known else None

@@ -27,7 +27,8 @@ RESULT_PREFIX = "/mushpipe/"
 TIMING_TOPIC = "/mushpipe/timing"
 TOTAL = "total"  # how the time of all stages together is called
 NO_DEPTH = {"depth": "none"}  # metadata of the colour of a stage's frame without depth
-DRAWINGS = ("foxglove.ImageAnnotations", "foxglove.SceneUpdate")  # made of the tables beside them
+# for viewers, made of the tables beside them and of the graph
+DRAWINGS = ("foxglove.ImageAnnotations", "foxglove.SceneUpdate", "foxglove.FrameTransform")
 # name here -> name in ROS and Foxglove
 DISTORTION_MODELS = {
     "none": "",

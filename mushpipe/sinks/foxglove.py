@@ -10,7 +10,8 @@ from pydantic import Field, PrivateAttr
 from mushpipe import RunInfo, Sink, Trace
 from mushpipe.core import wire
 from mushpipe.core.errors import UsageError
-from mushpipe.sinks.messages import Published, result_messages, timing_message
+from mushpipe.core.transform import Transform, base_of
+from mushpipe.sinks.messages import Published, base_message, result_messages, timing_message
 
 logger = logging.getLogger("mushpipe")
 
@@ -31,6 +32,7 @@ class FoxgloveSink(Sink):
     _context: Any = PrivateAttr(None)
     _channels: dict[tuple[str, str], Any] = PrivateAttr(default_factory=dict)
     _unknown: set[type] = PrivateAttr(default_factory=set)
+    _base: Transform | None = PrivateAttr(None)
 
     def open(self, run: RunInfo) -> None:
         """Start the server.
@@ -41,6 +43,7 @@ class FoxgloveSink(Sink):
         import foxglove
 
         self._context = foxglove.Context()
+        self._base = base_of(run.manifest.get("graph", {}))
         try:
             self._server = foxglove.start_server(
                 name=f"mushpipe {run.recording}",
@@ -64,6 +67,8 @@ class FoxgloveSink(Sink):
             self._send(trace, (wire.CAMERA_TOPIC, wire.encode_camera(frame.camera, frame.header)))
         for published in result_messages(trace, self._unknown, drawn=True):
             self._send(trace, published)
+        if self._base is not None:
+            self._send(trace, base_message(self._base, frame.header))
         self._send(trace, timing_message(trace))
 
     def _send(self, trace: Trace, published: Published) -> None:

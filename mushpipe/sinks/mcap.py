@@ -14,7 +14,8 @@ from mushpipe import RunInfo, Sink, SinkPath, Trace
 from mushpipe.core.paths import STDIO
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.recording import MANIFEST, SUMMARY
-from mushpipe.sinks.messages import result_messages, timing_message
+from mushpipe.core.transform import Transform, base_of
+from mushpipe.sinks.messages import base_message, result_messages, timing_message
 
 
 class McapSink(Sink):
@@ -49,6 +50,7 @@ class McapSink(Sink):
     _part: int = PrivateAttr(0)
     _writer: RecordingWriter | None = PrivateAttr(None)
     _unknown: set[type] = PrivateAttr(default_factory=set)
+    _base: Transform | None = PrivateAttr(None)
 
     def files(self, run: RunInfo) -> tuple[Path, ...]:
         """Return the files it writes; of a split recording the first one and all there are."""
@@ -63,6 +65,7 @@ class McapSink(Sink):
     def open(self, run: RunInfo) -> None:
         """Create the file and write the manifest."""
         self._run, self._part = run, 0
+        self._base = base_of(run.manifest.get("graph", {}))
         self._writer = self._begin(run)
 
     def _begin(self, run: RunInfo) -> RecordingWriter:
@@ -82,6 +85,8 @@ class McapSink(Sink):
         results = result_messages(trace, self._unknown, self.drawings, self.frames is True)
         for topic, message in results:
             writer.write(topic, message, frame.header)
+        if self.drawings and self._base is not None:
+            writer.write(*base_message(self._base, frame.header), frame.header)
         if self.timing and trace.durations_ns:
             writer.write(*timing_message(trace), frame.header)
 

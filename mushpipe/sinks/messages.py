@@ -6,12 +6,14 @@ import logging
 from collections.abc import Iterator
 from typing import Any
 
-from mushpipe import RgbdFrame, Trace
+from mushpipe import Header, RgbdFrame, Trace
 from mushpipe.core import wire
 from mushpipe.core.scene import drawings
+from mushpipe.core.transform import Transform
 
 logger = logging.getLogger("mushpipe")
 Published = tuple[str, wire.Message]
+BASE_TOPIC = f"{wire.RESULT_PREFIX}T_base_camera"
 
 
 def result_messages(
@@ -59,6 +61,21 @@ def _made(frame: RgbdFrame, last: RgbdFrame) -> Iterator[wire.Message]:
         yield wire.encode_color(frame)._replace(suffix="/color")
     if frame.depth is not last.depth:
         yield wire.encode_depth(frame)._replace(suffix="/depth")
+
+
+def base_message(T_base_camera: Transform, header: Header) -> Published:  # noqa: N803
+    """Return where the camera is in the robot's frame, so that viewers can show both together."""
+    from foxglove.messages import FrameTransform, Quaternion, Vector3
+
+    (x, y, z), q = T_base_camera.translation, T_base_camera.quaternion
+    data = FrameTransform(
+        timestamp=wire.timestamp(header.stamp_ns),
+        parent_frame_id=T_base_camera.frame,
+        child_frame_id=header.frame_id,
+        translation=Vector3(x=x, y=y, z=z),
+        rotation=Quaternion(x=q[0], y=q[1], z=q[2], w=q[3]),
+    ).encode()
+    return BASE_TOPIC, wire.Message("", wire.foxglove_schema("FrameTransform"), data)
 
 
 def timing_message(trace: Trace) -> Published:

@@ -21,7 +21,7 @@ from pydantic import Field, PrivateAttr, model_validator
 from mushpipe import Header, RunInfo, Sink, SinkPath, Trace
 from mushpipe.core.errors import DependencyError, UsageError
 from mushpipe.core.recorder import RecordingError
-from mushpipe.core.transform import Transform
+from mushpipe.core.transform import Transform, base_of
 from mushpipe.sinks.rerun_memory import Remembering
 
 logger = logging.getLogger("mushpipe")
@@ -114,7 +114,7 @@ class RerunSink(Sink):
             raise UsageError(f"save: {self.save} cannot be written: {error}") from error
         self._memories = (Remembering(self._recording), Remembering(self._recording))
         graph = run.manifest.get("graph", {})
-        self._base = _base(graph)
+        self._base = base_of(graph)
         log_start(self._recording, _workspace(graph), self._base)
         image_hz = self.image_hz or (LIVE_IMAGE_HZ if run.live else None)
         self._period_ns = round(1e9 / image_hz) if image_hz else 0
@@ -243,13 +243,6 @@ def _workspace(graph: Any) -> tuple[Any, Any] | None:
         if sink.get("workspace"):
             return sink["workspace"]["low"], sink["workspace"]["high"]
     return None
-
-
-def _base(graph: Any) -> Transform | None:
-    """Return the pose of the camera in the robot's frame, where picks are given in that."""
-    stated = [stage.get("T_base_camera") for stage in graph.get("stages", {}).values()]
-    known = [Transform.model_validate(each) for each in stated if each]
-    return known[-1] if known else None
 
 
 def _reached_at(host: str) -> str:

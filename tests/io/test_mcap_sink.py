@@ -16,8 +16,9 @@ from mcap.records import Channel, Message, Metadata
 from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory
 
-from mushpipe import Header, Mask
+from mushpipe import Header, Mask, RunInfo
 from mushpipe.sinks.mcap import McapSink
+from mushpipe.traces import read_traces
 from tests.io.bags import FX, FY, OPTICAL, PERIOD, T0, color_pixels, depth_pixels
 from tests.io.values import (
     LENS,
@@ -243,3 +244,20 @@ def test_a_header_without_arrival_time_is_logged_at_its_stamp(tmp_path: Path) ->
     frame = make_frame(header=Header(T0, 0, OPTICAL))
     (row,) = by_topic(record(tmp_path / "out.mcap", [trace_of(frame)]))[COLOR]
     assert row[2].log_time == row[2].publish_time == T0
+
+
+def test_viewers_are_told_where_the_camera_is_in_the_robots_frame(tmp_path: Path) -> None:
+    base = {"frame": "base", "translation": [0.4, -0.1, 0.9], "quaternion": [0.6, 0.0, 0.0, 0.8]}
+    manifest = {"graph": {"stages": {"pick": {"use": "picks", "T_base_camera": base}}}}
+    sink = McapSink(path=tmp_path / "a.mcap")
+    sink.open(RunInfo("bed", manifest))
+    sink.consume(trace_of(make_frame(), pick=replace(make_picks(), frame_id="base")))
+    sink.close()
+    ((schema, _, _, told),) = by_topic(tmp_path / "a.mcap")["/mushpipe/T_base_camera"]
+    assert schema.name == "foxglove.FrameTransform"
+    assert (told.parent_frame_id, told.child_frame_id) == ("base", OPTICAL)
+    assert [told.translation.x, told.translation.y, told.translation.z] == base["translation"]
+    rotation = told.rotation
+    assert [rotation.x, rotation.y, rotation.z, rotation.w] == base["quaternion"]
+    (trace,) = read_traces(tmp_path / "a.mcap")
+    assert set(trace.outputs) == {"pick"}
