@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import orjson
+from google.protobuf.message import DecodeError
 from mcap_protobuf.decoder import DecoderFactory
 
 from mushpipe.core.errors import InputError, UsageError
-from mushpipe.core.recording import MANIFEST, Raw, RecordingReader
+from mushpipe.core.recording import MANIFEST, Index, Raw, RecordingReader
 from mushpipe.core.types import Header, Mask, RgbdFrame, Trace
 from mushpipe.core.wire import (
     COLOR_TOPIC,
@@ -34,7 +35,12 @@ def read_manifest(path: Path) -> dict[str, Any]:
     Raises:
         InputError: What it says is no JSON object.
     """
-    stored = RecordingReader(path).index().metadata.get(MANIFEST, {})
+    return manifest_of(path, RecordingReader(path).index())
+
+
+def manifest_of(path: Path, index: Index) -> dict[str, Any]:
+    """Return that of a recording whose index was read; see `read_manifest`."""
+    stored = index.metadata.get(MANIFEST, {})
     try:
         manifest = json.loads(stored.get("json", "{}"))
     except ValueError:
@@ -112,7 +118,7 @@ def read_traces(path: Path) -> Iterator[Trace]:
     for frame in McapSource.model_validate(images).frames():
         try:
             trace = _trace(frame, results.take(frame.header), order)
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, DecodeError) as error:
             at = f"the results of frame {frame.header.sequence}"
             raise InputError(f"{path}: {at} cannot be read: {error}") from error
         yield trace
@@ -149,16 +155,20 @@ class _Results:
             messages, lambda raw: (raw.message.sequence, raw.message.publish_time)
         )
         self._waiting: dict[tuple[int, int], list[Raw]] = {}
-        self._read = -1  # number of the last frame
+        self._read = self._asked = -1  # numbers of frames
 
     def take(self, header: Header) -> list[Raw]:
         """Return the messages of a frame, none where there are none; stamps may stand still."""
         wanted = header.sequence, header.stamp_ns
+        if header.sequence < self._asked:  # numbers began anew, or frames are turned round
+            self._read = -1
+        self._asked = header.sequence
         while wanted not in self._waiting and self._read < header.sequence:
             key, group = next(self._groups, (None, ()))
             if key is None:
                 break
-            self._waiting[key], self._read = list(group), key[0]
+            self._waiting.setdefault(key, []).extend(group)
+            self._read = key[0]
             if len(self._waiting) > LOST:
                 del self._waiting[next(iter(self._waiting))]
         return self._waiting.pop(wanted, [])

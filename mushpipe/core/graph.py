@@ -5,18 +5,31 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mushpipe.core.document import Document, Location
 from mushpipe.core.errors import GraphError, PluginError, Problem, suggest
-from mushpipe.core.overrides import apply_override, not_utf8
+from mushpipe.core.faults import faults_of
+from mushpipe.core.overrides import apply_override, encoding_fault
+from mushpipe.core.overwriting import same_file
 from mushpipe.core.plan import Node, Plan
-from mushpipe.core.plugins import Registry
-from mushpipe.core.stage import OF_SOURCE, WORDS, Kind, Plugin, Source, ports_of, settings_of
-from mushpipe.core.wire import RESULT_PREFIX, TIMING_TOPIC, TOTAL
+from mushpipe.core.plugins import Registry, in_file
+from mushpipe.core.stage import (
+    OF_SOURCE,
+    WORDS,
+    Kind,
+    Plugin,
+    RunInfo,
+    Sink,
+    Source,
+    ports_of,
+    settings_of,
+)
+from mushpipe.core.wire import BASE_TOPIC, RESULT_PREFIX, TIMING_TOPIC, TOTAL
 from mushpipe.core.wiring import wire
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
@@ -60,8 +73,8 @@ def compile_document(
     """
     problems: list[Problem] = []
     if source is not None:
-        if (foreign := not_utf8(source)) is not None:
-            raise GraphError([Problem(f"--source {source}", 0, 0, foreign)])
+        if (fault := encoding_fault(source)) is not None:
+            raise GraphError([Problem(f"--source {source}", 0, 0, fault)])
         _replace_source(document, source, registry)
     for item in overrides:
         text, label = (item, "") if isinstance(item, str) else item
@@ -96,7 +109,7 @@ def _head(document: Document, problems: list[Problem]) -> GraphFile | None:
     try:
         return GraphFile.model_validate_json(json.dumps(document.data), strict=True)
     except ValidationError as error:
-        problems += _translate(document, (), error, GraphFile)
+        problems += faults_of(document, (), error, GraphFile)
         return None
 
 
@@ -121,7 +134,7 @@ def _replace_source(document: Document, source: str, registry: Registry) -> None
     given = {"use": "mcap", "path": source}
     if source == "-":
         given = {"use": "stream"}
-    elif is_name or ".py:" in source:
+    elif is_name or in_file(source):
         given = {"use": source}
     elif source.endswith(".bag"):
         given = {"use": "realsense", "file": source}
@@ -153,8 +166,8 @@ def _check_names(
             message = f"'{name}' is no name: letters, digits, - and _, beginning with a letter"
         elif name in GraphFile.model_fields:
             message = f"'{name}' is a key of the graph file and cannot name a stage or sink"
-        elif at[0] == "stages" and RESULT_PREFIX + name == TIMING_TOPIC:
-            message = f"'{name}' cannot name a stage: its results would stand where times do"
+        elif at[0] == "stages" and RESULT_PREFIX + name in (TIMING_TOPIC, BASE_TOPIC):
+            message = f"'{name}' cannot name a stage: its results would stand where others do"
         elif at[0] == "stages" and name == TOTAL:
             message = f"'{name}' cannot name a stage: so is the time of all of them called"
         elif at[0] == "sinks" and name in stages:
@@ -164,14 +177,29 @@ def _check_names(
     return problems
 
 
+class _Named(RunInfo):
+    """A run of which nothing is known yet: paths keep their braces, and no folder is made."""
+
+    def path(self, template: Path) -> Path:
+        """Return a path as it stands."""
+        return template
+
+
 def _check_files(document: Document, nodes: list[Node]) -> list[Problem]:
     """Return which sinks would write the same file; other ways to one are found by a run."""
-    problems, taken = [], dict[Path, str]()
+    problems: list[Problem] = []
+    taken: list[tuple[Path, str]] = []
     for node in nodes:
-        for setting, path in node.plugin.path_settings(written=True).items():
-            if (other := taken.setdefault(path, node.name)) != node.name:
-                message = f"sink '{node.name}' would write over the file of sink '{other}', {path}"
-                problems.append(document.problem(("sinks", node.name, setting), message))
+        files: tuple[Path, ...] = ()
+        with suppress(Exception):  # of a plugin, whose fault a run tells of
+            files = node.plugin.files(_Named("", {})) if isinstance(node.plugin, Sink) else ()
+        for path in files:
+            if others := [name for other, name in taken if same_file(path, other)]:
+                message = (
+                    f"sink '{node.name}' would write over the file of sink '{others[0]}', {path}"
+                )
+                problems.append(document.problem(("sinks", node.name), message, key=True))
+        taken += [(path, node.name) for path in files]
     return problems
 
 
@@ -212,7 +240,7 @@ def _node(
             context={"base": document.base.absolute(), "from_shell": document.from_shell(at)},
         )
     except ValidationError as error:
-        problems += _translate(document, at, error, plugin_class, use)
+        problems += faults_of(document, at, error, plugin_class, use)
         # never run, but its ports say whether it is wired
         unset = plugin_class.model_construct()
         return Node(str(at[-1]), kind, use, unset, ports, dict(inputs), delivery)
@@ -235,47 +263,3 @@ def _drop_foreign(
     for key in sorted(foreign):
         document.warnings.append(f"{at[-1]}: '{use}' has no setting '{key}'; it is dropped")
     return {key: value for key, value in settings.items() if key not in foreign}
-
-
-def _translate(
-    document: Document, at: Location, error: ValidationError, model: type[BaseModel], use: str = ""
-) -> list[Problem]:
-    """Turn pydantic's errors into problems with places and suggestions."""
-    problems = []
-    of = f" of '{use}'" if use else ""
-    for item in error.errors():
-        unknown, loc = item["type"] == "extra_forbidden", item["loc"]
-        if not unknown:  # where a setting may be of several types, pydantic's names for them
-            loc = tuple(part for part in loc if "[" not in str(part))
-        path, place = (*at, *loc), ".".join(map(str, loc))
-        name = str(loc[-1]) if loc else ""
-        if unknown:
-            what = f"unknown setting '{name}'{of}"
-            hint = suggest(name, known) if (known := _known(model, loc[:-1])) else ""
-            problems.append(document.problem(path, what, hint, True))
-        elif item["type"] == "missing":
-            text = f"setting '{place}'{of} is missing"
-            if isinstance(last := path[-1], int):  # of a list
-                text = f"{place.rpartition('.')[0]}{of}: value {last + 1} is missing"
-            problems.append(document.problem(path[:-1], text))
-        else:
-            what = place + of if place else f"'{use}'"
-            given = f", got {json.dumps(item['input'], default=str)}" if place else ""
-            message = item["msg"].removeprefix("Value error, ")
-            if not place:  # of all settings together, which the command line may have changed
-                labels = [text for key, text in document.overrides.items() if key[:-1] == at]
-                given = f" (with {', '.join(labels)})" if labels else ""
-            problems.append(document.problem(path, f"{what}: {message}{given}"))
-    return problems
-
-
-def _known(model: type[BaseModel], place: Location) -> list[str]:
-    """Return the names of the settings at a place in a model, none where it is no group."""
-    for part in place:
-        field = model.model_fields.get(settings_of(model).get(str(part), ""))
-        kinds = (field.annotation, *get_args(field.annotation)) if field else ()
-        groups = [k for k in kinds if isinstance(k, type) and issubclass(k, BaseModel)]
-        if len(groups) != 1:
-            return []
-        model = groups[0]
-    return list(settings_of(model))

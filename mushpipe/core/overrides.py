@@ -18,8 +18,8 @@ def apply_override(document: Document, text: str, label: str = "") -> list[Probl
     messages where the change comes from.
     """
     label = label or f"--set {text}"
-    if (foreign := not_utf8(text)) is not None:
-        return [Problem(label, 0, 0, foreign)]
+    if (fault := encoding_fault(text)) is not None:
+        return [Problem(label, 0, 0, fault)]
     path, equals, value_text = text.partition("=")
     if not equals:
         return [Problem(label, 0, 0, "expected a.b=value")]
@@ -43,7 +43,7 @@ def apply_override(document: Document, text: str, label: str = "") -> list[Probl
     return []
 
 
-def not_utf8(text: str) -> str | None:
+def encoding_fault(text: str) -> str | None:
     """Say that a text of the command line is not UTF-8, as graphs and recordings are."""
     try:
         text.encode()

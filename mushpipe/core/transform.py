@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -115,6 +116,8 @@ TransformSetting = Annotated[
 
 def base_of(graph: Mapping[str, Any]) -> Transform | None:
     """Return the pose of the camera in the robot's frame, where a graph gives picks in that."""
-    stated = [stage.get("T_base_camera") for stage in graph.get("stages", {}).values()]
-    known = [Transform.model_validate(each) for each in stated if each]
-    return known[-1] if known else None
+    known = None
+    for stage in graph.get("stages", {}).values():
+        with suppress(ValidationError):  # another plugin's setting of that name
+            known = Transform.model_validate(stage.get("T_base_camera"))
+    return known

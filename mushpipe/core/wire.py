@@ -25,6 +25,7 @@ DEPTH_TOPIC = "/camera/aligned_depth_to_color/image_raw"
 CAMERA_TOPIC = "/camera/color/camera_info"
 RESULT_PREFIX = "/mushpipe/"
 TIMING_TOPIC = "/mushpipe/timing"
+BASE_TOPIC = "/mushpipe/T_base_camera"
 TOTAL = "total"  # how the time of all stages together is called
 NO_DEPTH = {"depth": "none"}  # metadata of the colour of a stage's frame without depth
 # for viewers, made of the tables beside them and of the graph

@@ -18,6 +18,7 @@ from mushpipe.evaluate.judging import (
     Rules,
     Summary,
     find_truth,
+    foreign_truth,
     judge_results,
     summarise,
 )
@@ -160,6 +161,7 @@ def _judge_files(request: Request) -> Evaluation:
         results = read_results(file, request.topic)
         known = truth or find_truth(results)
         judged = judge_results(results, known, request.rules, name=name)
+        _note_foreign(request, judged)
         evaluation.recordings.append(judged)
     _require_judged(evaluation)
     return evaluation
@@ -207,10 +209,17 @@ def _judge_run(
 ) -> Judged:
     results = read_results(result_path(plan), request.topic)
     known = truth or find_truth(results)
-    if not recordings:
-        return judge_results(results, known, request.rules)
-    name = unique_names(recordings)[number]
-    return judge_results(results, known, request.rules, recordings[number], name)
+    played = recordings[number] if recordings else None
+    name = unique_names(recordings)[number] if recordings else ""
+    judged = judge_results(results, known, request.rules, played, name)
+    _note_foreign(request, judged)
+    return judged
+
+
+def _note_foreign(request: Request, judged: Judged) -> None:
+    """Note where the truth that was given is another recording's."""
+    if request.truth and (note := foreign_truth(judged.results, judged.truth)):
+        judged.notes.append(note)
 
 
 def _with_truth(recordings: list[Path]) -> list[Path]:

@@ -134,8 +134,6 @@ def judge_results(
             f"counted from {start} s on: label them by 'stamp_ns', or run the whole recording"
         )
     _judge_frames(judged, rules)
-    if foreign := _foreign(results, truth):
-        judged.notes.append(foreign)
     if not all(map(comparable, judged.verdicts)):
         judged.notes.append("truth and results are in different frames: 3D errors are unknown")
     unanswered = _unanswered(judged)
@@ -169,7 +167,7 @@ def _judge_frames(judged: Judged, rules: Rules) -> None:
         judged.notes.append(f"{repeated} frames repeat the stamp of another and are not judged")
 
 
-def _foreign(results: Results, truth: TruthSet) -> str:
+def foreign_truth(results: Results, truth: TruthSet) -> str:
     """Say that the truth is carried by another recording than the one that was played."""
     stated = results.manifest.get("recordings") or []
     played = {entry["sha256"]: entry["file"] for entry in stated if entry.get("sha256")}

@@ -14,7 +14,7 @@ from mushpipe.core.recording import Index, Raw, RecordingReader
 from mushpipe.core.tables import Circles, Columns, Floats, PickFlag, Picks, column
 from mushpipe.core.types import Header
 from mushpipe.core.wire import TIMING_TOPIC, TOTAL, decode_table
-from mushpipe.traces import read_manifest, stage_times
+from mushpipe.traces import manifest_of, stage_times
 
 PICKS, CIRCLES = "mushpipe.Picks", "mushpipe.Circles"
 
@@ -116,7 +116,8 @@ def read_results(path: Path, topic: str | None = None) -> Results:
         UsageError: Several topics hold some and none is named.
     """
     reader = RecordingReader(path)
-    index, manifest = reader.index(), read_manifest(path)
+    index = reader.index()
+    manifest = manifest_of(path, index)
     topic = _choose(reader, index, topic)
     results = Results(path, topic, manifest=manifest)
     found: dict[tuple[int, int], tuple[Header, Detections]] = {}

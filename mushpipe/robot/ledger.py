@@ -55,17 +55,18 @@ class Ledger:
         if holder is None and not visible:
             raise Refusal("unknown_target", f"m{target} is neither visible nor accepted")
         if holder not in (None, owner):
-            raise Refusal("conflict", f"m{target} is held by another robot")
+            raise Refusal("conflict", f"m{target} is held, or done, by another robot")
         if target in self._done:
             return "removed"  # for good, whatever is said later
+        held = outcome == "accepted" or (outcome != "done" and hold_s > 0)
+        if held and entry is None and len(self._entries) >= MOST_ENTRIES:
+            raise Refusal("busy", f"{MOST_ENTRIES} targets are held already")
         self.version += 1
         self._entries.pop(target, None)
         if outcome == "done":
             self._done[target] = owner
             return "removed"
-        if outcome == "accepted" or hold_s > 0:
-            if entry is None and len(self._entries) >= MOST_ENTRIES:
-                raise Refusal("busy", f"{MOST_ENTRIES} targets are held already")
+        if held:
             wait = self._claim_s if outcome == "accepted" else hold_s
             self._entries[target] = _Entry(owner, now + wait)
             return "removed"

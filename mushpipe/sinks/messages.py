@@ -13,7 +13,6 @@ from mushpipe.core.transform import Transform
 
 logger = logging.getLogger("mushpipe")
 Published = tuple[str, wire.Message]
-BASE_TOPIC = f"{wire.RESULT_PREFIX}T_base_camera"
 
 
 def result_messages(
@@ -75,7 +74,7 @@ def base_message(T_base_camera: Transform, header: Header) -> Published:  # noqa
         translation=Vector3(x=x, y=y, z=z),
         rotation=Quaternion(x=q[0], y=q[1], z=q[2], w=q[3]),
     ).encode()
-    return BASE_TOPIC, wire.Message("", wire.foxglove_schema("FrameTransform"), data)
+    return wire.BASE_TOPIC, wire.Message("", wire.foxglove_schema("FrameTransform"), data)
 
 
 def timing_message(trace: Trace) -> Published:

@@ -28,10 +28,8 @@ from mushpipe.sources.realsense_frames import Clock as SensorClock
 from mushpipe.sources.realsense_frames import Domain, clock_of
 
 logger = logging.getLogger("mushpipe")
-# Stamps further from the host's clock than this are in a clock of their own, if nobody says more,
+# Stamps further from the host's clock than this are late, or in a clock of their own.
 SAME_CLOCK_NS = 2 * 10**9
-# or late by so much at most, if earlier ones were in the host's.
-LONGEST_WAIT_NS = 60 * 10**9
 
 
 class RobotJsonSink(Sink):
@@ -90,8 +88,7 @@ class RobotJsonSink(Sink):
     _transcript: Transcript | None = PrivateAttr(None)
     _ending: Ending = PrivateAttr("failed")
     _live: bool = PrivateAttr(False)
-    _warned: bool = PrivateAttr(False)
-    _shared: bool = PrivateAttr(False)  # whether a stamp was seen to be on the host's clock
+    _warned: set[str] = PrivateAttr(default_factory=set)
 
     @field_validator("bind")
     @classmethod
@@ -217,28 +214,24 @@ class RobotJsonSink(Sink):
         if not self._live or self._placer is None:
             return played
         sensor = clock_of(trace.frame)
-        shared = self._is_of_host(header, sensor)
+        own_ms = header.stamp_ns / 1e6 if sensor is None else float(sensor.time_ms[0])
+        late = self._lateness.of(own_ms, header.stamp_ns, played)
+        shared = _is_of_host(header, sensor)
         stamp_ns = min(header.stamp_ns, header.arrival_ns) if shared else header.arrival_ns
         placed = self._placer.place(stamp_ns)
         if placed is None:
-            if not self._warned:
-                self._warned = True
-                logger.warning("the camera's time stamps are not of this host: robots get nothing")
+            self._warn("the camera's time stamps are not of this host: robots get nothing")
             return float("-inf")
-        taken = min(placed, played)
         if not shared:
-            own_ms = header.stamp_ns / 1e6 if sensor is None else float(sensor.time_ms[0])
-            # as it left the source: where it was placed, it may be too early by a jump
-            taken -= self._lateness.of(own_ms, header.stamp_ns, played)
-        return taken - self.sensor_latency_ms / 1000
+            played -= late
+            if 1000 * late > self.max_age_ms:
+                self._warn("frames come later than the quickest did, by more than 'max_age_ms'")
+        return min(placed, played) - self.sensor_latency_ms / 1000
 
-    def _is_of_host(self, header: Header, sensor: SensorClock | None) -> bool:
-        """Return whether a frame's stamp is on the clock on which it arrived."""
-        if sensor is not None:
-            return bool(sensor.domain[0] != Domain.HARDWARE)
-        wait_ns = header.arrival_ns - header.stamp_ns
-        self._shared |= 0 <= wait_ns <= SAME_CLOCK_NS
-        return self._shared and 0 <= wait_ns <= LONGEST_WAIT_NS
+    def _warn(self, text: str) -> None:
+        if text not in self._warned:
+            self._warned.add(text)
+            logger.warning("%s", text)
 
     def finish(self, summary: Mapping[str, Any]) -> None:
         """Note how the run ended, for the robots' last word."""
@@ -258,6 +251,13 @@ class RobotJsonSink(Sink):
         if self._transcript is not None:
             self._transcript.close()
             self._transcript = None
+
+
+def _is_of_host(header: Header, sensor: SensorClock | None) -> bool:
+    """Return whether a frame's stamp is on the clock on which it arrived."""
+    if sensor is not None:
+        return bool(sensor.domain[0] != Domain.HARDWARE)
+    return 0 <= header.arrival_ns - header.stamp_ns <= SAME_CLOCK_NS
 
 
 def _is_loopback(address: str) -> bool:

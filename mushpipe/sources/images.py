@@ -143,6 +143,11 @@ def _decode_compressed_depth(message: Any, scale: float | None) -> tuple[NDArray
     return metres, _known_scale(scale, 1.0, "32FC1")
 
 
+def distortion(message: Any) -> list[float]:
+    """Return the distortion that a CameraInfo or CameraCalibration states."""
+    return [float(v) for v in (message.d if hasattr(message, "d") else message.D)]
+
+
 def decode_camera(message: Any, rectified: bool = False) -> Camera | None:
     """Decode CameraInfo or CameraCalibration; None where it says that it is not calibrated.
 
@@ -155,7 +160,7 @@ def decode_camera(message: Any, rectified: bool = False) -> Camera | None:
         ValueError: The distortion model is one that is not implemented, or a number is not finite.
     """
     k = list(message.k if hasattr(message, "k") else message.K)
-    d = [float(v) for v in (message.d if hasattr(message, "d") else message.D)]
+    d = distortion(message)
     if rectified:
         p, d = list(message.p if hasattr(message, "p") else message.P), []
         k = [*p[:3], *p[4:7], *p[8:11]] if len(p) == 12 and p[0] > 0 else k

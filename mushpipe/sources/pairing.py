@@ -13,8 +13,9 @@ D = TypeVar("D")
 class Pairing(Generic[C, D]):
     """Pairs two streams of stamped items within a tolerance; every colour item comes out once.
 
-    Stamps must rise within each stream. A colour item waits until its depth item came, later
-    items show that none will, or `PATIENCE` further items of a kind have arrived.
+    Stamps rise within each stream, or go back where a clock was set. A colour item waits until its
+    depth item came, later items show that none will, or `PATIENCE` further items of a kind have
+    arrived.
     """
 
     PATIENCE = 32
@@ -22,21 +23,38 @@ class Pairing(Generic[C, D]):
     def __init__(self, tolerance_ns: int) -> None:
         self.tolerance_ns = tolerance_ns
         self.color_alone = self.depth_alone = 0
+        self._last_color = self._last_depth = 0
         self._colors: deque[tuple[int, C]] = deque()
         self._depths: deque[tuple[int, D]] = deque()
 
     def add_color(self, stamp_ns: int, item: C) -> Iterator[tuple[C, D | None]]:
-        """Add a colour item; yield what is settled by it."""
+        """Add a colour item; yield what is settled by it.
+
+        Where stamps go back, nothing that came before can belong to what follows.
+        """
+        if stamp_ns < self._last_color - self.tolerance_ns:
+            yield from self._settle(last=True)
+            self._forget(stamp_ns + self.tolerance_ns)
+        self._last_color = stamp_ns
         self._colors.append((stamp_ns, item))
         yield from self._settle(last=False)
 
     def add_depth(self, stamp_ns: int, item: D) -> Iterator[tuple[C, D | None]]:
         """Add a depth item; yield what is settled by it."""
+        if stamp_ns < self._last_depth - self.tolerance_ns and not self._colors:
+            self._forget(stamp_ns)
+        self._last_depth = stamp_ns
         self._depths.append((stamp_ns, item))
         if not self._colors and len(self._depths) > self.PATIENCE:
             self._depths.popleft()
             self.depth_alone += 1
         yield from self._settle(last=False)
+
+    def _forget(self, beyond_ns: int) -> None:
+        """Count depth items of later stamps as alone: they are from before stamps went back."""
+        kept = [each for each in self._depths if each[0] <= beyond_ns]
+        self.depth_alone += len(self._depths) - len(kept)
+        self._depths = deque(kept)
 
     def finish(self) -> Iterator[tuple[C, D | None]]:
         """Yield what is left, and count the depth items nobody took."""
@@ -50,7 +68,6 @@ class Pairing(Generic[C, D]):
             while self._depths and self._depths[0][0] < stamp - self.tolerance_ns:
                 self._depths.popleft()
                 self.depth_alone += 1
-            # where stamps went back, any of them may be too late or too early
             near = [d for d in self._depths if abs(d[0] - stamp) <= self.tolerance_ns]
             if not (last or self._impatient() or self._is_final(stamp, near)):
                 return

@@ -20,7 +20,7 @@ from mushpipe.core.geometry import Camera
 from mushpipe.core.recording import Raw
 from mushpipe.core.stage import Source
 from mushpipe.core.types import Header, RgbdFrame
-from mushpipe.sources.images import decode_camera, decode_color, decode_depth
+from mushpipe.sources.images import decode_camera, decode_color, decode_depth, distortion
 from mushpipe.sources.pairing import Pairing
 from mushpipe.sources.topics import Topics, is_beside, says_aligned
 
@@ -172,7 +172,7 @@ class Player:
 
         def decode(message: Any, raw: Raw) -> Camera | None:
             self._calibrated = _stamp(message, raw)[1]
-            if "image_rect_raw" in name and any(getattr(message, "d", None) or message.D):
+            if "image_rect_raw" in name and any(distortion(message)):
                 self._warn_rectified()  # realsense2_camera's name, also where it rectified nothing
             return decode_camera(message, rectified)
 

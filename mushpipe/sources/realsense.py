@@ -177,7 +177,7 @@ class RealsenseSource(ReplaySource):
                 self._counts[UNPLAYED] += link.unplayed()
                 return
             frame = maker.make(frames, time.time_ns()) if frames is not None else None
-            if maker.whole > whole:
+            if maker.whole > whole or not (frames is None or link.live):
                 quiet_s, whole = 0.0, maker.whole
                 self._is_back()
             else:

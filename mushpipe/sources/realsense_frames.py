@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import IntEnum
 from types import SimpleNamespace
@@ -64,9 +65,11 @@ def clock_of(frame: RgbdFrame) -> Clock | None:
     """Return what the sensor said of a frame, of a camera here or at the other end of a stream."""
     clock = frame.attached.get(CLOCK_TOPIC)
     if isinstance(clock, Message) and clock.schema.name == f"mushpipe.{Clock.__name__}":
-        columns = orjson.loads(clock.data)
-        return Clock(columns["number"], columns["time_ms"], columns["domain"])
-    return clock if isinstance(clock, Clock) else None
+        with suppress(ValueError, KeyError, TypeError):  # whatever was sent
+            columns = orjson.loads(clock.data)
+            clock = Clock(columns["number"], columns["time_ms"], columns["domain"])
+    known = isinstance(clock, Clock) and len(clock) > 0 and np.isfinite(clock.time_ms).all()
+    return clock if known else None
 
 
 class FrameMaker:

@@ -7,7 +7,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mushpipe import Sink
+from mushpipe import RunInfo, Sink, SinkPath
 from mushpipe.core.document import Document, parse_document, read_document
 from mushpipe.core.errors import GraphError
 from mushpipe.core.graph import compile_document
@@ -194,7 +194,7 @@ graph.yaml:1:1: setting 'source' is missing
 }
 
 
-@pytest.mark.parametrize("name", ["timing", "total"])
+@pytest.mark.parametrize("name", ["timing", "total", "T_base_camera"])
 def test_names_that_results_use_are_no_stages(lab: Lab, name: str):
     text = f"mushpipe: 1\nsource: {{use: frames}}\nstages:\n  {name}: {{use: threshold}}\n"
     assert f"'{name}' cannot name a stage" in lab.faults(text)
@@ -289,9 +289,36 @@ def test_two_sinks_on_one_file_are_a_fault(lab: Lab):
           c: {use: mcap, path: "y/{recording}.mcap"}
     """)
     path = f"{lab.folder.absolute()}/x/{{recording}}.mcap"
-    said = f"graph.yaml:5:24: sink 'b' would write over the file of sink 'a', {path}\n"
+    said = f"graph.yaml:5:3: sink 'b' would write over the file of sink 'a', {path}\n"
     assert text.startswith(said)
     assert text.count("would write over") == 1
+
+
+def test_sinks_may_share_what_is_no_file_of_theirs(lab: Lab):
+    class Pages(Sink):
+        """A file of its own in a folder."""
+
+        folder: SinkPath
+
+        def files(self, run: RunInfo) -> tuple[Path, ...]:
+            return (self.folder / f"{id(self)}.txt",)
+
+        def consume(self) -> None:
+            """Take nothing."""
+
+    lab.registry.sink("mcap", McapSink)
+    lab.registry.sink("pages", Pages)
+    lab.compile("""
+        mushpipe: 1
+        source: {use: frames}
+        sinks:
+          a: {use: mcap, path: /dev/null}
+          b: {use: mcap, path: /dev/null}
+          c: {use: mcap, path: x.mcap}
+          d: {use: mcap, path: x.mcap, split_size: 1GB}
+          e: {use: pages, folder: pages}
+          f: {use: pages, folder: pages}
+    """)
 
 
 def test_a_missing_setting_is_placed_at_its_plugin(lab: Lab):

@@ -252,3 +252,10 @@ def test_a_lens_that_is_left_out_for_the_name_of_its_images_is_told_of(
     found = play(write_bag(tmp_path, [info, *colors]))
     assert [frame.camera.model for frame in found if frame.camera] == ["none"] * 3
     assert caplog.text.count("the distortion that its calibration states is not applied") == 1
+
+
+def test_rectified_images_of_a_calibration_without_distortion(tmp_path: Path) -> None:
+    topic = "/camera/camera/color/image_rect_raw"
+    colors = [(topic, at, message) for _, at, message in COLORS]
+    found = play(write_bag(tmp_path, [info_at(0, d=()), *colors]))
+    assert [frame.camera for frame in found] == [CALIBRATED] * 3

@@ -248,7 +248,11 @@ def test_a_header_without_arrival_time_is_logged_at_its_stamp(tmp_path: Path) ->
 
 def test_viewers_are_told_where_the_camera_is_in_the_robots_frame(tmp_path: Path) -> None:
     base = {"frame": "base", "translation": [0.4, -0.1, 0.9], "quaternion": [0.6, 0.0, 0.0, 0.8]}
-    manifest = {"graph": {"stages": {"pick": {"use": "picks", "T_base_camera": base}}}}
+    stages = {
+        "pick": {"use": "picks", "T_base_camera": base},
+        "own": {"use": "mine.py:Mine", "T_base_camera": [1, 2, 3]},  # means something else there
+    }
+    manifest = {"graph": {"stages": stages}}
     sink = McapSink(path=tmp_path / "a.mcap")
     sink.open(RunInfo("bed", manifest))
     sink.consume(trace_of(make_frame(), pick=replace(make_picks(), frame_id="base")))

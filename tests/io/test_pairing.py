@@ -197,3 +197,19 @@ def test_no_pair_is_further_apart_than_the_tolerance(
     pairs += pairing.finish()
     assert all(depth is None or abs(color - depth) <= tolerance for color, depth in pairs)
     assert [color for color, _ in pairs] == [stamp for is_color, stamp in items if is_color]
+
+
+@pytest.mark.parametrize("lost", [None, "color", "depth"])
+@pytest.mark.parametrize("first", ["color", "depth"])
+def test_after_stamps_went_back_pairs_are_found_at_once(first: str, lost: str | None) -> None:
+    pairing: Pairing[int, int] = Pairing(5)
+    pairs = []
+    for number in range(80):
+        stamp = 10_000 + 33 * number - (3000 if number >= 40 else 0)
+        for kind in ("color", "depth") if first == "color" else ("depth", "color"):
+            if not (number == 39 and kind == lost):
+                add = pairing.add_color if kind == "color" else pairing.add_depth
+                pairs += add(stamp, stamp)
+    pairs += pairing.finish()
+    assert sum(depth == color for color, depth in pairs) >= 77
+    assert all(depth in (None, color) for color, depth in pairs)

@@ -243,3 +243,16 @@ def test_a_manifest_that_is_no_json_is_told_of(tmp_path: Path) -> None:
     writer.close()
     with pytest.raises(InputError, match=r"'mushpipe\.manifest' hold no JSON object"):
         list(read_traces(path))
+
+
+def test_numbers_that_begin_anew_cost_no_results(tmp_path: Path) -> None:
+    """Of a camera whose counter starts again."""
+    numbers, traces = [10, 11, 12, 0, 1, 2], []
+    for i, number in enumerate(numbers):
+        trace = full_trace(i)
+        header = replace(trace.frame.header, sequence=number)
+        traces.append(replace(trace, frame=replace(trace.frame, header=header, attached={})))
+    found = list(read_traces(record(tmp_path / "out.mcap", traces)))
+    assert [trace.frame.header.sequence for trace in found] == numbers
+    for trace, again in zip(traces, found, strict=True):
+        same(trace.outputs["open"][0], again.outputs["open"][0])

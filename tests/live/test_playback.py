@@ -9,6 +9,7 @@ import pytest
 
 from mushpipe import RgbdFrame
 from mushpipe.core.errors import EXIT_DAMAGED, EXIT_OK, EXIT_USAGE, InputError
+from mushpipe.sources import realsense
 from mushpipe.sources.realsense import RealsenseSource
 from mushpipe.sources.realsense_frames import CLOCK_TOPIC, Domain
 from tests.core.lab import Lab, cli
@@ -157,3 +158,34 @@ def test_the_program_plays_a_bag(bag, tmp_path, monkeypatch, capsys):
     assert "error: no.bag: there is no such recording" in capsys.readouterr().err
     Path("b.bag").write_bytes(damaged(bag, "overwritten"))
     assert cli(monkeypatch, "run", "graph.yaml", "--source", "b.bag") == EXIT_DAMAGED
+
+
+def test_a_recording_whose_depth_stops_is_played_to_its_end(monkeypatch):
+    """Silence is for cameras: how long a file takes depends on the machine."""
+
+    class File:
+        live = False
+        left = 50
+
+        def wait(self):
+            self.left -= 1
+            return object() if self.left >= 0 else None
+
+        def ended(self):
+            return True
+
+        def unplayed(self):
+            return 0
+
+        def check(self, quiet_s, patience_s):
+            raise AssertionError("nobody asks whether it is silent")
+
+    class Maker:
+        whole = 0
+
+        def make(self, frames, arrival_ns):
+            return None
+
+    ticks = iter(range(10**6))
+    monkeypatch.setattr(realsense.time, "monotonic", lambda: next(ticks))
+    assert list(RealsenseSource(file="a.bag")._played(File(), Maker())) == []

@@ -24,7 +24,7 @@ from mushpipe.robot.hub import Hub, Settings
 from mushpipe.robot.messages import Refusal
 from mushpipe.sinks import robot_json
 from mushpipe.sinks.robot_json import RobotJsonSink
-from mushpipe.sources.realsense_frames import CLOCK_TOPIC, Domain
+from mushpipe.sources.realsense_frames import CLOCK_TOPIC, Domain, clock_of
 from mushpipe.sources.realsense_frames import Clock as SensorClock
 from tests.robot.peer import Peer
 from tests.robot.scene import EPOCH_NS, FakeClock, choice, make_picks
@@ -256,11 +256,53 @@ def test_a_picture_of_a_camera_that_says_nothing_of_its_clock_is_old_where_it_wa
     sink.open(LIVE)
     clock = sink._clock
     assert isinstance(clock, FakeClock)
-    for waited in (0.0, 0.3, 1.9, 2.5, 6.0):
+    for waited in (0.0, 0.3, 1.9, 2.5, 6.0, 30.0, 61.0, 300.0):
         clock.now += 10
         stamp = clock.wall_ns() - round(off_s * 1e9)
         clock.now += waited
-        assert ages(sink, stamp, clock.wall_ns()) == pytest.approx(1000 * waited, abs=10)
+        # against stamps, it may have drifted by 0.2 ms a second since the quickest one
+        assert ages(sink, stamp, clock.wall_ns()) == pytest.approx(1000 * waited, abs=100)
+
+
+@pytest.mark.parametrize("jump", [-30.0, 5.0, 30.0, 59.0, 3600.0])
+def test_a_clock_that_is_set_costs_a_camera_with_a_clock_of_its_own_nothing(
+    sink: RobotJsonSink, jump: float
+) -> None:
+    """Its stamps began near the host's and go on by themselves."""
+    sink.open(LIVE)
+    clock = sink._clock
+    assert isinstance(clock, FakeClock)
+    stamp, found = clock.wall_ns(), []
+    for number in range(300):
+        clock.now += 0.2
+        stamp += 200_000_000
+        clock.offset_s = jump if number > 50 else 0.0
+        found.append(ages(sink, stamp, clock.wall_ns()))
+    assert max(found[:50] + found[250:]) <= 10
+
+
+def test_what_a_frame_waits_in_a_stream_counts_once(sink: RobotJsonSink) -> None:
+    """Between its arrival at the sender's host and this program."""
+    sink.open(LIVE)
+    clock = sink._clock
+    assert isinstance(clock, FakeClock)
+    for waited in (0.0, 0.1, 0.3):
+        clock.now += 1
+        stamp = clock.wall_ns()
+        clock.now += waited
+        attached = sensor_at(stamp - EPOCH_NS, Domain.HARDWARE)
+        frame = replace(frame_at(stamp, stamp), attached=attached)
+        sink.consume(make_picks(), Trace(frame, {}, {}, NOW_NS))
+        assert sink._server
+        assert sink._server.hub.age_ms(clock.now) == pytest.approx(1000 * waited, abs=2)
+
+
+@pytest.mark.parametrize("data", [b"{", b"{}", b'{"number":[],"time_ms":[],"domain":[]}',
+                                  b'{"number":[1],"time_ms":[null],"domain":[0]}'])  # fmt: skip
+def test_a_clock_that_cannot_be_read_is_none(data: bytes) -> None:
+    schema = wire.table_schema(SensorClock)
+    frame = replace(frame_at(1), attached={CLOCK_TOPIC: wire.Message("", schema, data)})
+    assert clock_of(frame) is None
 
 
 def test_a_frame_whose_age_nobody_knows_is_stale(

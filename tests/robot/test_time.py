@@ -176,7 +176,7 @@ def test_what_is_done_stays_away_for_good() -> None:
     ledger.settle(1e9)
     assert hidden(ledger) == {1}
     assert ledger.apply("a", 1, "failed", 0, visible=True, now=1e9) == "removed"
-    with pytest.raises(Refusal, match="held by another robot"):
+    with pytest.raises(Refusal, match="held, or done, by another robot"):
         ledger.apply("b", 1, "accepted", 0, visible=True, now=1e9)
 
 

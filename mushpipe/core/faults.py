@@ -1,0 +1,56 @@
+"""What pydantic finds wrong with settings, as problems with a place in the graph file."""
+
+from __future__ import annotations
+
+import json
+from typing import get_args
+
+from pydantic import BaseModel, ValidationError
+
+from mushpipe.core.document import Document, Location
+from mushpipe.core.errors import Problem, suggest
+from mushpipe.core.stage import settings_of
+
+
+def faults_of(
+    document: Document, at: Location, error: ValidationError, model: type[BaseModel], use: str = ""
+) -> list[Problem]:
+    """Turn pydantic's errors into problems with places and suggestions."""
+    problems = []
+    of = f" of '{use}'" if use else ""
+    for item in error.errors():
+        unknown, loc = item["type"] == "extra_forbidden", item["loc"]
+        if not unknown:  # where a setting may be of several types, pydantic's names for them
+            loc = tuple(part for part in loc if "[" not in str(part))
+        path, place = (*at, *loc), ".".join(map(str, loc))
+        name = str(loc[-1]) if loc else ""
+        if unknown:
+            what = f"unknown setting '{name}'{of}"
+            hint = suggest(name, known) if (known := _known(model, loc[:-1])) else ""
+            problems.append(document.problem(path, what, hint, True))
+        elif item["type"] == "missing":
+            text = f"setting '{place}'{of} is missing"
+            if isinstance(last := path[-1], int):  # of a list
+                text = f"{place.rpartition('.')[0]}{of}: value {last + 1} is missing"
+            problems.append(document.problem(path[:-1], text))
+        else:
+            what = place + of if place else f"'{use}'"
+            given = f", got {json.dumps(item['input'], default=str)}" if place else ""
+            message = item["msg"].removeprefix("Value error, ")
+            if not place:  # of all settings together, which the command line may have changed
+                labels = [text for key, text in document.overrides.items() if key[:-1] == at]
+                given = f" (with {', '.join(labels)})" if labels else ""
+            problems.append(document.problem(path, f"{what}: {message}{given}"))
+    return problems
+
+
+def _known(model: type[BaseModel], place: Location) -> list[str]:
+    """Return the names of the settings at a place in a model, none where it is no group."""
+    for part in place:
+        field = model.model_fields.get(settings_of(model).get(str(part), ""))
+        kinds = (field.annotation, *get_args(field.annotation)) if field else ()
+        groups = [k for k in kinds if isinstance(k, type) and issubclass(k, BaseModel)]
+        if len(groups) != 1:
+            return []
+        model = groups[0]
+    return list(settings_of(model))
