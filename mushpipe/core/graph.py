@@ -192,7 +192,8 @@ def _check_files(document: Document, nodes: list[Node]) -> list[Problem]:
     for node in nodes:
         files: tuple[Path, ...] = ()
         with suppress(Exception):  # of a plugin, whose fault a run tells of
-            files = node.plugin.files(_Named("", {})) if isinstance(node.plugin, Sink) else ()
+            if isinstance(node.plugin, Sink):
+                files = tuple(map(Path, node.plugin.files(_Named("", {}))))
         for path in files:
             if others := [name for other, name in taken if same_file(path, other)]:
                 message = (
