@@ -10,6 +10,7 @@ as OpenCV does.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.polynomial import Polynomial
@@ -74,6 +75,7 @@ def brown_inverse(xy: Array, coefficients: tuple[float, ...], iterations: int = 
     return guess
 
 
+@cache
 def _fold(coefficients: tuple[float, ...]) -> float:
     """Return the least r^2 at which the radial part of `brown` no longer grows; inf without one."""
     k1, k2, _, _, k3, *below = coefficients
@@ -124,12 +126,16 @@ class Camera:
             )
 
     def project(self, points: Array) -> Array:
-        """Project (..., 3) points in metres to (..., 2) pixels; NaN behind the camera."""
+        """Project (..., 3) points in metres to (..., 2) pixels.
+
+        NaN behind the camera, and beyond the angle up to which the lens model holds.
+        """
         points = np.asarray(points, dtype=np.float64)
         z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
         xy = points[..., :2] / z[..., None]
         if self.model in _FORWARD:
-            xy = brown(xy, self.coefficients)
+            beyond = (xy**2).sum(axis=-1) >= _fold(self.coefficients)
+            xy = np.where(beyond[..., None], np.nan, brown(xy, self.coefficients))
         elif self.model == "inverse_brown_conrady":
             xy = brown_inverse(xy, self.coefficients)
         return np.asarray(xy * (self.fx, self.fy) + (self.cx, self.cy))

@@ -102,9 +102,11 @@ class Onnx(Stage):
 
     def _letterbox(self, shape: tuple[Any, ...], width: int, height: int) -> Letterbox:
         """Return how an image lies in the model's input, of this shape (1, 3, H, W)."""
-        free = self.size or (width + -width % 32, height + -height % 32)
+        own = (width + -width % 32, height + -height % 32)
+        free = self.size or own
         fixed = [n if isinstance(n, int) else f for n, f in zip(shape[:1:-1], free, strict=True)]
-        return letterbox((width, height), (fixed[0], fixed[1]), (fixed[0], fixed[1]) != free)
+        canvas = fixed[0], fixed[1]
+        return letterbox((width, height), canvas, enlarge=canvas != own)
 
     def _values(self, canvas: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return an image (h, w, 3) RGB as the model wants it, (1, 3, h, w)."""

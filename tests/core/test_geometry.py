@@ -211,3 +211,12 @@ def test_no_ray_lies_on_the_other_side_of_the_axis(lens: tuple[float, ...], foca
     order = np.argsort(np.hypot(*aside[known].T))
     reach = np.maximum.accumulate(np.hypot(*ray[known][order].T))
     assert (reach - np.hypot(*ray[known][order].T)).max() < 0.05
+
+
+def test_a_point_beyond_the_fold_of_a_lens_is_not_in_the_image():
+    """Its polynomial turns round there, and would put the point where another one is seen."""
+    lens = Camera(640, 480, 400.0, 400.0, 319.5, 239.5, "brown_conrady", (-0.3, 0, 0, 0, 0))
+    fold = (1 / 0.9) ** 0.5  # d/dr of r - 0.3 r^3 is 0
+    inside, beyond = lens.project(np.array([[0.99 * fold, 0, 1], [1.01 * fold, 0, 1.0]]))
+    assert inside[0] == pytest.approx(319.5 + 400 * 0.99 * fold * (1 - 0.3 * (0.99 * fold) ** 2))
+    assert np.isnan(beyond).all()

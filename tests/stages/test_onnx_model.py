@@ -46,6 +46,19 @@ def test_a_fixed_input_is_letterboxed_and_taken_back(tmp_path: Path) -> None:
     assert (mask.foreground != (image > 0.5)).mean() < 0.01
 
 
+@pytest.mark.parametrize("fixed", [True, False])
+def test_an_image_is_enlarged_to_the_size_that_is_asked_for(tmp_path: Path, fixed: bool) -> None:
+    """The box that is found covers the image, whose lower edge lies at half of a square input."""
+    box = np.array([[160.0, 160.0, 320.0, 160.0, 0.9]])
+    shape = [1, 3, 320, 320] if fixed else [1, 3, "h", "w"]
+    model = answering(tmp_path / "m.onnx", box.T[None], image=shape)
+    color = np.zeros((80, 160, 3), np.uint8)
+    stage = Onnx(model=model, output="yolov8", size=(320, 320))
+    _, circles = stage.process(RgbdFrame(HEADER, color))
+    assert circles.center[0] == pytest.approx([79.5, 39.5])
+    assert circles.radius[0] == pytest.approx(np.sqrt(160 * 80) / 2)
+
+
 def test_the_three_layouts_of_yolo_say_the_same_circles(tmp_path: Path) -> None:
     """A 160 x 100 image in a 320 x 320 input is twice as large, with 60 px of gray above."""
     frame = frame_of(np.zeros((100, 160)), camera=None)
