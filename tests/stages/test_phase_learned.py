@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mushpipe import Circles, InputError, Mask
+from mushpipe import Circles, Mask, UsageError
 from mushpipe.stages.phase_hough import PhaseHough
 from mushpipe.stages.phase_learned import add_discs, agreement, candidates_of
 from tests.stages.caps import cap, draw, frame_from
@@ -60,7 +60,7 @@ def test_discs_are_added_to_the_foreground_also_across_the_border() -> None:
 def test_without_circles_use_learned_says_what_is_missing() -> None:
     image, stage = discs([(60, 60, 20)], 0.8, 0.1), PhaseHough(use_learned=True)
     stage.open()
-    with pytest.raises(InputError, match="needs a stage above that finds circles"):
+    with pytest.raises(UsageError, match="needs a stage above that finds circles"):
         stage.process(frame_of(image), Mask(image > 0.5))
 
 
