@@ -151,9 +151,9 @@ def validate(
         _out(json.dumps({"problems": [], "warnings": warnings, "graph": plan.resolved()}))
     else:
         number = len(plan.warnings) + len(missing)
-        counted = [f"{_count(len(plan.stages), 'stage')}, {_count(len(plan.sinks), 'sink')}"]
-        counted += ["no faults", *([_count(number, "warning")] if number else [])]
-        _out(f"{graph}: {', '.join(counted)}")
+        parts = [_count(len(plan.stages), "stage"), _count(len(plan.sinks), "sink"), "no faults"]
+        parts += [_count(number, "warning")] if number else []
+        _out(f"{graph}: {', '.join(parts)}")
 
 
 def _count(number: int, what: str) -> str:

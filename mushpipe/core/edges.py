@@ -15,6 +15,7 @@ from typing import Any
 from mushpipe.core.errors import MushpipeError, PluginError, StageError
 from mushpipe.core.mailbox import Mailbox
 from mushpipe.core.plan import Node, Plan
+from mushpipe.core.plugins import in_file
 from mushpipe.core.report import Durations, SinkReport
 from mushpipe.core.stage import ReplaySource, RunInfo, Sink, Source
 from mushpipe.core.types import RgbdFrame
@@ -54,7 +55,7 @@ def files_read(plan: Plan) -> tuple[Path, ...]:
         PluginError: It gave no paths.
     """
     nodes = (plan.source, *plan.stages, *plan.sinks)
-    code = (node.use.rpartition(":")[0] for node in nodes if ".py:" in node.use)
+    code = (node.use.rpartition(":")[0] for node in nodes if in_file(node.use))
     given = (path for node in nodes for path in node.plugin.path_settings(written=False).values())
     graph = Path(plan.file)
     return (graph, *(graph.parent / file for file in code), *given, *files_of(plan.source))

@@ -245,7 +245,7 @@ def _node(
         # never run, but its ports say whether it is wired
         unset = plugin_class.model_construct()
         return Node(str(at[-1]), kind, use, unset, ports, dict(inputs), delivery)
-    if ".py:" in use:
+    if in_file(use):
         use = str((base / use).resolve())
     attributes = settings_of(plugin_class)
     paths = {

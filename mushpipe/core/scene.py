@@ -16,6 +16,7 @@ from mushpipe.core.wire import Message, foxglove_schema, timestamp
 
 # A pick does not carry the height of its dome; caps are drawn with this one, in radii.
 DOME = 0.6
+CORNER = 0.5  # viewers count px from the corner of the first pixel, mushpipe from its centre
 FULL_SIGMA = np.radians(20)  # tilt uncertainty that is drawn fully red
 CROWD = 40  # more mushrooms than this, and only their ids fit
 RED, AMBER, GREEN, CYAN = (255, 70, 70), (255, 190, 40), (60, 220, 90), (0, 200, 255)
@@ -71,14 +72,11 @@ def _colors(table: NDArray[np.uint8], alpha: float = 1.0) -> list[fox.Color]:
 
 
 def image_annotations(table: Circles | Picks, header: Header) -> bytes:
-    """Encode circles, and the labels of picks, as foxglove.ImageAnnotations.
-
-    Foxglove counts pixels from the corner of the first one, mushpipe from its centre.
-    """
+    """Encode circles, and the labels of picks, as foxglove.ImageAnnotations."""
     picks = table if isinstance(table, Picks) else None
     plain = [_color(CYAN)] * len(table)
     colors = plain if picks is None else _colors(SOURCE_COLORS[picks.source])
-    places = [fox.Point2(x=x, y=y) for x, y in (table.center + 0.5).tolist()]
+    places = [fox.Point2(x=x, y=y) for x, y in (table.center + CORNER).tolist()]
     circles = [
         fox.CircleAnnotation(position=place, diameter=size, thickness=2, outline_color=color)
         for place, size, color in zip(places, (2 * table.radius).tolist(), colors, strict=True)

@@ -158,11 +158,7 @@ def _judge_files(request: Request) -> Evaluation:
     truths = _given_truth(request, len(files))
     evaluation = Evaluation(request.rules)
     for file, truth, name in zip(files, truths, unique_names(files), strict=True):
-        results = read_results(file, request.topic)
-        known = truth or find_truth(results)
-        judged = judge_results(results, known, request.rules, name=name)
-        _note_foreign(request, judged)
-        evaluation.recordings.append(judged)
+        evaluation.recordings.append(_judge(request, file, truth, None, name))
     _require_judged(evaluation)
     return evaluation
 
@@ -191,35 +187,31 @@ def _judge_graph(
         option.label: Evaluation(request.rules, label=option.label) for option in options
     }
     worst = EXIT_OK
+    played: list[tuple[Path | None, str]] = [(None, "")]
+    if recordings:
+        played = [*zip(recordings, unique_names(recordings), strict=True)]
     for option, number, plan in plans(graph, recordings, request.overrides, options, folder):
         report = runner(plan)
         require_results(report)
         if report.error is not None:
             logger.warning("%s: %s", option.label or graph, report.error)
         worst = worst or report.exit_code
-        judged = _judge_run(request, plan, truths[number], recordings, number)
+        judged = _judge(request, result_path(plan), truths[number], *played[number])
         evaluations[option.label].recordings.append(judged)
     for evaluation in evaluations.values():
         _require_judged(evaluation)
     return list(evaluations.values()), worst
 
 
-def _judge_run(
-    request: Request, plan: Plan, truth: TruthSet | None, recordings: Sequence[Path], number: int
+def _judge(
+    request: Request, results: Path, truth: TruthSet | None, recording: Path | None, name: str
 ) -> Judged:
-    results = read_results(result_path(plan), request.topic)
-    known = truth or find_truth(results)
-    played = recordings[number] if recordings else None
-    name = unique_names(recordings)[number] if recordings else ""
-    judged = judge_results(results, known, request.rules, played, name)
-    _note_foreign(request, judged)
-    return judged
-
-
-def _note_foreign(request: Request, judged: Judged) -> None:
-    """Note where the truth that was given is another recording's."""
-    if request.truth and (note := foreign_truth(judged.results, judged.truth)):
+    """Judge a file of results; notes where the truth that was given is another recording's."""
+    found = read_results(results, request.topic)
+    judged = judge_results(found, truth or find_truth(found), request.rules, recording, name)
+    if request.truth and (note := foreign_truth(found, judged.truth)):
         judged.notes.append(note)
+    return judged
 
 
 def _with_truth(recordings: list[Path]) -> list[Path]:

@@ -10,14 +10,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe import Camera, Circles, Header, Mask, PickFlag, Picks, RgbdFrame, Trace
-from mushpipe.core.scene import CYAN, DOME, GREEN, SOURCE_COLORS, in_order, labels, posed, tints
+from mushpipe.core.scene import (
+    CORNER,
+    CYAN,
+    DOME,
+    GREEN,
+    SOURCE_COLORS,
+    in_order,
+    labels,
+    posed,
+    tints,
+)
 from mushpipe.core.transform import Transform
 from mushpipe.core.wire import jpeg
 from mushpipe.sinks import rerun_layout as at
 
 _FEW = 4  # px between those that a statistic is taken of
 FIRST = 20  # picks whose place in the order is written beside them
-CORNER = 0.5  # Rerun counts px from the corner of the first pixel, not from its centre
 _WHEEL = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (213, 94, 0),
           (204, 121, 167), (150, 150, 255), (190, 190, 190))  # fmt: skip
 

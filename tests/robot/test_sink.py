@@ -189,6 +189,13 @@ def test_an_age_counts_from_the_camera_on_the_monotonic_clock(sink: RobotJsonSin
     assert ages(sink, clock.wall_ns() + 10**10) is None
 
 
+def age_of(sink: RobotJsonSink, frame: RgbdFrame, attached: dict[str, Any]) -> int | None:
+    """Return the age in ms of a frame with what its sensor said, as it has left its source."""
+    sink.consume(make_picks(), Trace(replace(frame, attached=attached), {}, {}, NOW_NS))
+    assert sink._server
+    return sink._server.hub.age_ms(sink._clock.monotonic())
+
+
 def sensor_at(stamp_ns: int, domain: Domain) -> dict[str, SensorClock]:
     return {CLOCK_TOPIC: SensorClock(np.zeros(1), np.array([stamp_ns / 1e6]), np.array([domain]))}
 
@@ -201,12 +208,8 @@ def test_a_picture_that_waited_in_the_camera_is_old(sink: RobotJsonSink, domain:
     for waited in (0.0, 0.1, 3.0):
         stamp = clock.wall_ns()
         clock.now += waited
-        frame = replace(
-            frame_at(stamp, clock.wall_ns()), attached=sensor_at(stamp - EPOCH_NS, domain)
-        )
-        sink.consume(make_picks(), Trace(frame, {}, {}, NOW_NS))
-        assert sink._server
-        age = sink._server.hub.age_ms(clock.now)
+        attached = sensor_at(stamp - EPOCH_NS, domain)
+        age = age_of(sink, frame_at(stamp, clock.wall_ns()), attached)
         assert age == pytest.approx(1000 * waited, abs=2)
 
 
@@ -222,10 +225,8 @@ def test_the_cameras_clock_counts_at_the_other_end_of_a_stream(sink: RobotJsonSi
         header = frame_at(stamp, clock.wall_ns()).header
         (beside,) = sensor_at(stamp - EPOCH_NS, Domain.HARDWARE).values()
         (sent,) = wire.encoder_of(SensorClock)(beside, header)
-        frame = replace(frame_at(stamp, clock.wall_ns()), attached={CLOCK_TOPIC: sent})
-        sink.consume(make_picks(), Trace(frame, {}, {}, NOW_NS))
-        assert sink._server
-        assert sink._server.hub.age_ms(clock.now) == pytest.approx(1000 * waited, abs=2)
+        age = age_of(sink, frame_at(stamp, clock.wall_ns()), {CLOCK_TOPIC: sent})
+        assert age == pytest.approx(1000 * waited, abs=2)
 
 
 @pytest.mark.parametrize("jump", [-8.0, -2.0, -0.3, 2.0])
@@ -242,10 +243,7 @@ def test_a_clock_that_is_set_makes_targets_old_for_seconds_alone(
         clock.offset_s = jump if number > 50 else 0.0
         stamp = first + round(own * 1e9)
         attached = sensor_at(round(own * 1e9), Domain.HARDWARE)
-        frame = replace(frame_at(stamp, clock.wall_ns()), attached=attached)
-        sink.consume(make_picks(), Trace(frame, {}, {}, NOW_NS))
-        assert sink._server
-        ages_ms.append(sink._server.hub.age_ms(clock.now))
+        ages_ms.append(age_of(sink, frame_at(stamp, clock.wall_ns()), attached))
     assert max(ages_ms[:50] + ages_ms[120:]) <= 10
 
 
@@ -291,10 +289,8 @@ def test_what_a_frame_waits_in_a_stream_counts_once(sink: RobotJsonSink) -> None
         stamp = clock.wall_ns()
         clock.now += waited
         attached = sensor_at(stamp - EPOCH_NS, Domain.HARDWARE)
-        frame = replace(frame_at(stamp, stamp), attached=attached)
-        sink.consume(make_picks(), Trace(frame, {}, {}, NOW_NS))
-        assert sink._server
-        assert sink._server.hub.age_ms(clock.now) == pytest.approx(1000 * waited, abs=2)
+        age = age_of(sink, frame_at(stamp, stamp), attached)
+        assert age == pytest.approx(1000 * waited, abs=2)
 
 
 @pytest.mark.parametrize("data", [b"{", b"{}", b'{"number":[],"time_ms":[],"domain":[]}',
