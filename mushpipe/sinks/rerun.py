@@ -74,7 +74,7 @@ class RerunSink(Sink):
     _notes: _Notes | None = PrivateAttr(None)
     _period_ns: int = PrivateAttr(0)
     _next_ns: int = PrivateAttr(0)
-    _shown: tuple[list[str], float | None] | None = PrivateAttr(None)
+    _shown: tuple[list[str], float | None, list[str]] | None = PrivateAttr(None)
     _memories: tuple[Remembering, Remembering] | None = PrivateAttr(None)  # images, results
     _last: Header | None = PrivateAttr(None)
     _base: Transform | None = PrivateAttr(None)
@@ -99,7 +99,7 @@ class RerunSink(Sink):
         """
         import rerun as rr
 
-        from mushpipe.sinks.rerun_log import log_start
+        from mushpipe.sinks.rerun_style import log_start
 
         sinks: list[Any] = []
         if self.save:
@@ -167,29 +167,32 @@ class RerunSink(Sink):
         rec, header, (images, results) = self._recording, trace.frame.header, self._memories
         rerun_log.set_frame(rec, header)
         self._last = header
-        self._lay_out(trace)
+        stages = self._lay_out(trace)
         since_ns = header.stamp_ns - self._next_ns + self._period_ns
         if not 0 <= since_ns < self._period_ns:  # also after a leap, forwards or back
             self._next_ns = header.stamp_ns + self._period_ns
             rerun_log.log_images(images, trace, self.jpeg_quality, self.cloud_step)
             images.settle()
-        rerun_log.log_results(results, trace, self._base)
+        rerun_log.log_results(results, trace, self._base, stages)
         results.settle()
         self._write_notes(rr)
 
-    def _lay_out(self, trace: Trace) -> None:
-        """Send the layout as soon as a frame shows which layers, and whether depth, there are."""
+    def _lay_out(self, trace: Trace) -> list[str]:
+        """Return the stages in the plot; send the layout when a frame shows more to lay out."""
         from mushpipe.sinks.rerun_layout import layout
-        from mushpipe.sinks.rerun_log import distance_of, layers_of, log_layers
+        from mushpipe.sinks.rerun_log import distance_of, layers_of
+        from mushpipe.sinks.rerun_style import log_layers
 
-        if self._shown is not None and all(self._shown):
-            return
-        before = self._shown or ([], None)
-        shown = (before[0] or layers_of(trace), before[1] or distance_of(trace.frame))
-        if shown != self._shown:
-            self._shown = shown
-            log_layers(self._recording, shown[0], [*trace.durations_ns])
-            self._recording.send_blueprint(layout(*shown))
+        layers, distance, stages = self._shown or ([], None, [])
+        if not (layers and distance and stages):
+            layers = layers or layers_of(trace)
+            distance = distance or distance_of(trace.frame)
+            stages = stages or [*trace.durations_ns]
+        if self._shown != (layers, distance, stages):
+            self._shown = layers, distance, stages
+            log_layers(self._recording, layers, stages)
+            self._recording.send_blueprint(layout(layers, distance))
+        return stages
 
     def _write_notes(self, rr: Any) -> None:
         while self._notes is not None and self._notes.waiting:

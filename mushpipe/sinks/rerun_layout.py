@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-IMAGE = "camera/image"
+CAMERA = "camera"
+IMAGE = f"{CAMERA}/image"
 # layers of the image by what a stage puts out, in the order in which they are drawn
 FRAMES, INITIAL, MASKS = f"{IMAGE}/frames", f"{IMAGE}/initial", f"{IMAGE}/masks"
 CIRCLES, PICKS, IDS = f"{IMAGE}/circles", f"{IMAGE}/picks", f"{IMAGE}/ids"
 COLOR, DEPTH, HOLES = f"{IMAGE}/color", f"{IMAGE}/depth", f"{IMAGE}/holes"
-CLOUD, BASE = "camera/cloud", "camera/base"
+CLOUD, BASE = f"{CAMERA}/cloud", f"{CAMERA}/base"
 # in space, below the camera or below the robot's base, by the frame of the picks
 SPACE = CAPS, AXES, TARGETS, ORDER, WORKSPACE = "caps", "axes", "picks", "order", "workspace"
 COUNTS, TIMES, VALIDITY, LOG = "plots/count", "plots/time", "plots/depth", "log"
@@ -68,9 +69,9 @@ def _space_view(distance: float) -> Any:
     import rerun.blueprint as rrb
 
     return rrb.Spatial3DView(
-        origin="camera",
+        origin=CAMERA,
         name="Bed",
-        contents=[IMAGE, CLOUD, *(f"camera/{name}" for name in SPACE), f"{BASE}/**"],
+        contents=[IMAGE, CLOUD, *(f"{CAMERA}/{name}" for name in SPACE), f"{BASE}/**"],
         eye_controls=rrb.EyeControls3D(
             position=(0.0, 0.6 * distance, 0.25 * distance),
             look_target=(0.0, 0.04 * distance, distance),

@@ -1,8 +1,12 @@
-"""What is written to Rerun of one frame: images, results in the image and in space, plots, log."""
+"""What is written to Rerun of one frame: images, results in the image and in space, plots, log.
+
+Sixteen messages a frame, made in Python: so each has what is of this frame and nothing else (how it
+looks is told once, in `rerun_style`), and colours are packed as Rerun stores them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -12,9 +16,7 @@ from numpy.typing import NDArray
 from mushpipe import Camera, Circles, Header, Mask, PickFlag, Picks, RgbdFrame, Trace
 from mushpipe.core.scene import (
     CORNER,
-    CYAN,
     DOME,
-    GREEN,
     SOURCE_COLORS,
     in_order,
     labels,
@@ -27,8 +29,6 @@ from mushpipe.sinks import rerun_layout as at
 
 _FEW = 4  # px between those that a statistic is taken of
 FIRST = 20  # picks whose place in the order is written beside them
-_WHEEL = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (213, 94, 0),
-          (204, 121, 167), (150, 150, 255), (190, 190, 190))  # fmt: skip
 
 
 def results(trace: Trace, kind: type) -> Iterator[tuple[str, Any]]:
@@ -74,58 +74,6 @@ def layers_of(trace: Trace) -> list[str]:
     circles = [f"{at.CIRCLES}/{stage}" for stage, _ in results(trace, Circles)]
     picks = [at.PICKS, at.IDS] if any(results(trace, Picks)) else []
     return [*changed(trace), *masks(trace), *circles, *picks]
-
-
-def log_layers(rec: Any, layers: Sequence[str], stages: Sequence[str]) -> None:
-    """Log the colours of masks, initial contours, holes, and of the stages in the plot."""
-    import rerun as rr
-
-    for number, stage in enumerate(stages):
-        _draw_series(rec, f"{at.TIMES}/{stage}", _WHEEL[number % len(_WHEEL)])
-
-    styles = {
-        at.MASKS: ("mushroom", (70, 150, 255, 255)),
-        at.INITIAL: ("initial", (255, 150, 30, 255)),
-        at.HOLES: ("no depth", (255, 40, 40, 255)),
-    }
-    for entity in (*layers, at.HOLES):
-        for prefix, style in styles.items():
-            if entity.startswith(prefix):
-                context = rr.AnnotationContext([(0, "", (0, 0, 0, 0)), (1, *style)])
-                rec.log(entity, context, static=True)
-
-
-def log_start(rec: Any, box: tuple[Any, Any] | None, base: Transform | None) -> None:
-    """Log what holds for the whole run: directions, names, workspace (m), T_base_camera."""
-    import rerun as rr
-
-    # Seen from above: x to the right, y (down in the image) towards the viewer, z down.
-    rec.log("camera", rr.ViewCoordinates.RBD, static=True)
-    names = {"found": (200, 200, 200), "located": GREEN, "oriented": (80, 160, 255)}
-    for name, color in names.items():
-        _draw_series(rec, f"{at.COUNTS}/{name}", color)
-    _draw_series(rec, f"{at.VALIDITY}/valid", (255, 120, 200))
-    if box is not None:
-        low, high = np.array(box)
-        shown = rr.Boxes3D(
-            mins=[low], sizes=[high - low], colors=(255, 255, 255), labels=["workspace"]
-        )
-        rec.log(f"{'camera' if base is None else at.BASE}/{at.WORKSPACE}", shown, static=True)
-    if base is not None:  # T_base_camera takes what is below the camera to what is below the base
-        pose = rr.Transform3D(
-            translation=base.translation,
-            quaternion=rr.Quaternion(xyzw=base.quaternion),
-            relation=rr.TransformRelation.ChildFromParent,
-        )
-        rec.log(at.BASE, pose, static=True)
-
-
-def _draw_series(rec: Any, entity: str, color: tuple[int, int, int]) -> None:
-    """Draw a series as a line with dots, so that a single frame shows as well."""
-    import rerun as rr
-
-    rec.log(entity, rr.SeriesLines(colors=color), static=True)
-    rec.log(entity, rr.SeriesPoints(colors=color, marker_sizes=3), static=True)
 
 
 def log_images(rec: Any, trace: Trace, jpeg_quality: int, cloud_step: int) -> None:
@@ -180,7 +128,7 @@ def _log_cloud(rec: Any, frame: RgbdFrame, camera: Camera, step: int) -> None:
     points = rays[known] * depth[known]
     colors = frame.color[::step, ::step].reshape(-1, 3)[known]
     radii = 0.6 * step * float(np.median(points[::_FEW, 2])) / camera.fx if len(known) else None
-    rec.log(at.CLOUD, rr.Points3D(points, colors=colors, radii=radii))
+    rec.log(at.CLOUD, rr.Points3D(points, colors=_packed(colors), radii=radii))
 
 
 @lru_cache(maxsize=4)
@@ -193,43 +141,49 @@ def _rays(camera: Camera, step: int) -> NDArray[np.float32]:
     return np.hstack([xy, z], dtype=np.float32)
 
 
-def log_results(rec: Any, trace: Trace, base: Transform | None) -> None:
+def log_results(rec: Any, trace: Trace, base: Transform | None, stages: Sequence[str]) -> None:
     """Log circles, picks in the image and in space, counts, times, and the frame's warnings."""
-    import rerun as rr
-
     for stage, circles in results(trace, Circles):
-        rec.log(f"{at.CIRCLES}/{stage}", _rings(circles, colors=CYAN))
-    for stage, duration in trace.durations_ns.items():
-        rec.log(f"{at.TIMES}/{stage}", rr.Scalars(duration / 1e6))
+        rec.log(f"{at.CIRCLES}/{stage}", _rings(circles))
+    if trace.durations_ns:
+        _log_series(rec, at.TIMES, stages, {n: t / 1e6 for n, t in trace.durations_ns.items()})
     picks = next((value for _, value in reversed([*results(trace, Picks)])), None)
     if picks is not None:
         _log_picks(rec, picks)
         if picks.frame_id in ("", trace.frame.header.frame_id):
-            _log_space(rec, picks, "camera")
+            _log_space(rec, picks, at.CAMERA)
         elif base is not None and picks.frame_id == base.frame:
             _log_space(rec, picks, at.BASE)  # elsewhere nobody knows how they lie to the camera
 
 
-def _rings(table: Circles | Picks, **style: Any) -> Any:
+def _log_series(rec: Any, entity: str, names: Sequence[str], values: Mapping[str, float]) -> None:
+    """Log a value for each line of a plot, in the order in which `rerun_style` names them."""
+    import rerun as rr
+
+    rec.log(entity, rr.Scalars([values.get(name, np.nan) for name in names]))
+
+
+def _packed(colors: NDArray[np.uint8], alpha: int = 255) -> NDArray[np.uint32]:
+    """Return colours (N, 3) as Rerun stores them, (N,)."""
+    red, green, blue = colors.T.astype(np.uint32)
+    return np.asarray(red << 24 | green << 16 | blue << 8 | np.uint32(alpha), np.uint32)
+
+
+def _rings(table: Circles | Picks, **colors: Any) -> Any:
     import rerun as rr
 
     sizes = np.repeat(table.radius[:, None], 2, axis=1)
-    return rr.Ellipses2D(centers=table.center + CORNER, half_sizes=sizes, draw_order=30, **style)
+    return rr.Ellipses2D.from_fields(centers=table.center + CORNER, half_sizes=sizes, **colors)
 
 
 def _log_picks(rec: Any, picks: Picks) -> None:
     import rerun as rr
 
-    rec.log(at.PICKS, _rings(picks, colors=SOURCE_COLORS[picks.source]))
-    ids = rr.Points2D(
-        picks.center + CORNER, radii=0.5, colors=(255, 255, 255), labels=labels(picks),
-        show_labels=True, draw_order=40,
-    )  # fmt: skip
-    rec.log(at.IDS, ids)
+    rec.log(at.PICKS, _rings(picks, colors=_packed(SOURCE_COLORS[picks.source])))
+    rec.log(at.IDS, rr.Points2D.from_fields(positions=picks.center + CORNER, labels=labels(picks)))
     located = in_order(picks)
     counts = {"found": len(picks), "located": len(located), "oriented": len(posed(picks, located))}
-    for name, count in counts.items():
-        rec.log(f"{at.COUNTS}/{name}", rr.Scalars(float(count)))
+    _log_series(rec, at.COUNTS, [*counts], counts)
     text, level = _summary(picks)
     rec.log(at.LOG, rr.TextLog(text, level=level))
 
@@ -239,10 +193,10 @@ def _log_space(rec: Any, picks: Picks, place: str) -> None:
     import rerun as rr
 
     located = in_order(picks)
-    points, colors = picks.position[located], SOURCE_COLORS[picks.source[located]]
-    rec.log(f"{place}/{at.TARGETS}", rr.Points3D(points, radii=0.002, colors=colors))
+    points, colors = picks.position[located], _packed(SOURCE_COLORS[picks.source[located]])
+    rec.log(f"{place}/{at.TARGETS}", rr.Points3D.from_fields(positions=points, colors=colors))
     order = [f"{i + 1}" for i in range(min(len(located), FIRST))]
-    first = rr.Points3D(points[:FIRST], radii=0.003, colors=(255, 255, 255), labels=order)
+    first = rr.Points3D.from_fields(positions=points[:FIRST], labels=order)
     rec.log(f"{place}/{at.ORDER}", first)
     _log_caps(rec, picks, posed(picks, located), place)
 
@@ -252,15 +206,16 @@ def _log_caps(rec: Any, picks: Picks, rows: NDArray[np.intp], place: str) -> Non
 
     radius, axis, apex = picks.diameter[rows] / 2, picks.axis[rows], picks.position[rows]
     colors = tints(picks.sigma_tilt[rows])
-    caps = rr.Ellipsoids3D(
+    caps = rr.Ellipsoids3D.from_fields(
         centers=apex - DOME * radius[:, None] * axis,
         half_sizes=radius[:, None] * (1, 1, DOME),
         quaternions=picks.quaternion[rows],
-        colors=np.column_stack([colors, np.full(len(rows), 90, np.uint8)]),
-        fill_mode="solid",
+        colors=_packed(colors, alpha=90),
     )
     rec.log(f"{place}/{at.CAPS}", caps)
-    arrows = rr.Arrows3D(origins=apex, vectors=radius[:, None] * axis, colors=colors, radii=0.0012)
+    arrows = rr.Arrows3D.from_fields(
+        origins=apex, vectors=radius[:, None] * axis, colors=_packed(colors)
+    )
     rec.log(f"{place}/{at.AXES}", arrows)
 
 

@@ -29,7 +29,7 @@ def test_results_are_shown_with_all_their_layers(tmp_path: Path) -> None:
     assert CliRunner().invoke(app, ["view", str(results), "--save", str(out)]).exit_code == 0
     rows = entities(out)
     assert rows["/camera/image/picks"] == rows["/camera/image/color"] == 3
-    assert rows["/plots/time/detect"] == 3
+    assert rows["/plots/time"] == 3
     assert len(RrdReader(out).blueprints()) == 1
 
 

@@ -235,11 +235,21 @@ def test_a_frame_without_depth_or_answer_does_not_show_those_of_the_one_before(
 def test_counts_and_times_are_plotted(tmp_path: Path) -> None:
     traces = [trace_of(make_frame(i), detect=make_circles(), pick=make_picks()) for i in range(2)]
     found = show(tmp_path, traces)
-    for name, expected in (("found", 2.0), ("located", 1.0), ("oriented", 1.0)):
-        rows = [row for row in values(found, f"/plots/count/{name}", "scalars") if row]
-        assert rows == [[expected]] * 2
-    times = [row for row in values(found, "/plots/time/pick", "scalars") if row]
-    assert times == [[0.002]] * 2
+    lines = {
+        "/plots/count": (["found", "located", "oriented"], [2.0, 1.0, 1.0]),
+        "/plots/time": (["detect", "pick"], [0.001, 0.002]),
+    }
+    for plot, (names, expected) in lines.items():
+        assert [row for row in values(found, plot, "scalars") if row] == [expected] * 2
+        assert [row for row in values(found, plot, "names") if row] == [names]
+
+
+def test_a_stage_without_a_time_leaves_a_gap_in_its_own_line(tmp_path: Path) -> None:
+    both = trace_of(make_frame(0), detect=make_circles(), pick=make_picks())
+    second = trace_of(make_frame(1), pick=make_picks())
+    found = show(tmp_path, [both, second])
+    times = [row for row in values(found, "/plots/time", "scalars") if row]
+    np.testing.assert_array_equal(times, [[0.001, 0.002], [np.nan, 0.001]])
 
 
 def test_warnings_stand_in_the_log_at_their_frame(tmp_path: Path) -> None:
@@ -320,4 +330,5 @@ def test_picks_in_the_robots_frame_stand_below_its_base(tmp_path: Path) -> None:
 def test_picks_in_a_frame_that_nobody_placed_are_not_drawn_in_space(tmp_path: Path) -> None:
     found = show(tmp_path, [trace_of(make_frame(), pick=many(3, "elsewhere"))])
     assert len(values(found, f"{IMAGE}/picks", "centers")[0]) == 3
-    assert not [entity for entity in found if entity.endswith(("/caps", "/axes", "/order"))]
+    for name in ("picks", "order", "caps", "axes"):  # how they would look stands there, no more
+        assert not [column for column in found[f"/camera/{name}"] if column in ("frame", "capture")]

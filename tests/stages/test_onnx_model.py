@@ -46,6 +46,18 @@ def test_a_fixed_input_is_letterboxed_and_taken_back(tmp_path: Path) -> None:
     assert (mask.foreground != (image > 0.5)).mean() < 0.01
 
 
+@pytest.mark.parametrize("image", [[1, 3, "h", "w"], ["n", 3, "side", "side"]])
+def test_images_of_several_sizes_follow_one_another(tmp_path: Path, image: list[int | str]) -> None:
+    """Also where the model's maker gave height and width one name."""
+    model = of_brightness(tmp_path / "m.onnx", *BRIGHT, image=image)
+    stage = Onnx(model=model, output="logits")
+    for height, width in ((32, 64), (64, 64), (96, 32), (32, 64)):
+        color = np.zeros((height, width, 3), np.uint8)
+        color[: height // 2] = 255
+        mask, _ = stage.process(RgbdFrame(HEADER, color))
+        assert np.array_equal(mask.foreground, color[..., 0] > 0)
+
+
 @pytest.mark.parametrize("fixed", [True, False])
 def test_an_image_is_enlarged_to_the_size_that_is_asked_for(tmp_path: Path, fixed: bool) -> None:
     """The box that is found covers the image, whose lower edge lies at half of a square input."""
