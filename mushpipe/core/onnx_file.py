@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,8 @@ from numpy.typing import NDArray
 
 from mushpipe.core.errors import UsageError
 from mushpipe.core.libraries import import_onnxruntime
+
+Sizes = tuple[tuple[str, int], ...]  # of free dimensions, by their names
 
 
 class OnnxFile:
@@ -33,11 +36,12 @@ class OnnxFile:
         if not path.is_file():
             raise UsageError(f"model {path}: there is no such file")
         self.path = path
-        self._sizes: Mapping[str, int] = {}  # of free dimensions that the session is for
-        self._session = self._opened()
-        self.inputs = _shapes(self._session.get_inputs())
-        self.outputs = _shapes(self._session.get_outputs())
-        self.metadata: Mapping[str, str] = self._session.get_modelmeta().custom_metadata_map
+        # Two sizes at least: frames with and without depth may differ in theirs.
+        self._session = lru_cache(maxsize=3)(self._opened)
+        session = self._session(())
+        self.inputs = _shapes(session.get_inputs())
+        self.outputs = _shapes(session.get_outputs())
+        self.metadata: Mapping[str, str] = session.get_modelmeta().custom_metadata_map
 
     def __call__(self, image: NDArray[np.float32], output: str) -> NDArray[Any]:
         """Return one output for an image (1, C, H, W) as the only input.
@@ -47,8 +51,7 @@ class OnnxFile:
         """
         name = next(iter(self.inputs))
         try:
-            self._fit(image.shape)
-            found = self._session.run([output], {name: image})[0]
+            found = self._session(self._sizes(image.shape)).run([output], {name: image})[0]
         except Exception as error:
             raise UsageError(
                 f"model {self.path} expects {name} {list(self.inputs[name])} and got "
@@ -56,26 +59,24 @@ class OnnxFile:
             ) from error
         return np.asarray(found)
 
-    def _fit(self, shape: tuple[int, ...]) -> None:
-        """Read the network again for images of another shape, which makes it faster.
+    def _sizes(self, shape: tuple[int, ...]) -> Sizes:
+        """Return what the free dimensions are for images of a shape."""
+        free = next(iter(self.inputs.values()))
+        pairs = [pair for pair in zip(free, shape, strict=False) if isinstance(pair[0], str)]
+        sizes = dict(pairs)
+        one_each = all(sizes[name] == size for name, size in pairs)
+        return tuple(sizes.items()) if one_each else ()
+
+    def _opened(self, sizes: Sizes) -> Any:
+        """Return a session for images whose free dimensions are known, which is faster.
 
         ONNX Runtime adds into a convolution only what it knows beforehand to be of the same size.
         """
-        free = next(iter(self.inputs.values()))
-        pairs = {(dim, n) for dim, n in zip(free, shape, strict=False) if isinstance(dim, str)}
-        sizes = dict(pairs)
-        sizes = sizes if len(sizes) == len(pairs) else {}  # one name for two sizes
-        if sizes != self._sizes:
-            self._sizes = sizes
-            self._session = self._opened()
-
-    def _opened(self) -> Any:
-        """Return a session for the sizes."""
         runtime = import_onnxruntime()
         options = runtime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 3
-        for dim, size in self._sizes.items():
+        for dim, size in sizes:
             options.add_free_dimension_override_by_name(dim, size)
         try:
             return runtime.InferenceSession(

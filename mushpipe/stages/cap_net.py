@@ -40,13 +40,20 @@ class CapNet(Stage):
     """Detects caps in colour with a network of 161 000 parameters, trained on simulated beds.
 
     Heat map, radius, offset and mask at a quarter of the resolution (after CenterNet, Zhou et al.
-    2019, arXiv 1904.07850). The score is the height of a circle's peak. Depth is not used.
+    2019, arXiv 1904.07850). The score is the height of a circle's peak. Depth is not looked at.
     """
 
     radius_px: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]] = Field(
         (8, 45),
         description="smallest and largest radius, px; circles may be a tenth beyond; the image is "
         "scaled to suit",
+    )
+    beside_depth: float = Field(
+        1.0,
+        ge=0.5,
+        le=1,
+        description="scale of the image where the frame has depth, for a detector that uses it: "
+        "it needs less of the network, and 0.8 takes two thirds of the time",
     )
     min_score: float = Field(
         0.527, ge=0, le=1, description="smallest score that is kept; chosen on simulated beds"
@@ -96,7 +103,7 @@ class CapNet(Stage):
             UsageError: The model's output has not the shape of `cap-net`.
         """
         height, width = frame.color.shape[:2]
-        scale = self.scale()
+        scale = self.scale() * (1 if frame.depth is None else self.beside_depth)
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
         maps = self._maps(frame.color if scale == 1 else resized(frame.color, size))
         # pixel x of the frame lies at ratio (x + 1/2) - 1/2 of the scaled image
@@ -107,9 +114,10 @@ class CapNet(Stage):
         within = self._within(circles, width, height)
         circles, score = circles[within], score[within]
         keep = first_of_each(circles, self.overlap)
-        cap = resized(maps[MASK], (maps.shape[2] * STRIDE, maps.shape[1] * STRIDE))
-        cap = resized(np.ascontiguousarray(cap[: size[1], : size[0]]), (width, height))
-        return Mask(cap > 0), Circles(circles[keep, :2], circles[keep, 2], score[keep])
+        # the maps reach beyond the image, to whole blocks
+        reach = np.rint(STRIDE * ratio * maps.shape[:0:-1]).astype(int).tolist()
+        cap = resized(maps[MASK], (max(width, reach[0]), max(height, reach[1])))
+        return Mask(cap[:height, :width] > 0), Circles(circles[keep, :2], circles[keep, 2], score[keep])
 
     def scale(self) -> float:
         """Return by how much the image is scaled to bring the range of radii to the known ones."""

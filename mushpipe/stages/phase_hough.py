@@ -43,6 +43,7 @@ _AROUND = np.ones((7, 7), np.uint8)  # edges are taken so far around the foregro
 _STANDING = 0.004  # m; what is higher than this over the bed is looked at, in the mask or not
 _EVIDENCE = 0.07  # share of an outline that votes; half-hidden caps show hardly more
 _BESIDE = 0.14  # the same beside a network: what has less it sees as well, and fewer cost less time
+_EVERY = 2  # edge points; of so many one votes where network and depth bring candidates as well
 _REACH = 2  # cells around a peak within which it must be the highest
 _SEEN = 0.25  # of `learned`; without depth, what the network sees less of is no cap
 _LIKELY = 0.5  # score from which on a circle is more likely a cap than not
@@ -177,9 +178,9 @@ class PhaseHough(Stage):
         foreground = _foreground(inside, relief)
         region = np.ones_like(foreground) if literal else cv2.dilate(foreground, _AROUND)
         edges = self._edges(image, gradient, np.asarray(region, np.uint8), relief)
-        cells = vote(
-            edges, rings_between(smallest, largest), (-(-height // CELL), -(-width // CELL))
-        )
+        size = (-(-height // CELL), -(-width // CELL))
+        every = 1 if learned is None or relief is None else _EVERY
+        cells = vote(edges, rings_between(smallest, largest), size, every)
         evidence = self.evidence or (_EVIDENCE if learned is None else _BESIDE)
         found = peaks(*summed(cells), evidence, smallest, largest, _REACH)
         if learned is not None:

@@ -62,14 +62,19 @@ def phase_of(radius: NDArray[np.float64], smallest: float, largest: float) -> ND
 
 
 @jit
-def vote(edges: Strips, rings: Rings, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Return the accumulator (h, w, 2), real and imaginary part per cell."""
+def vote(
+    edges: Strips, rings: Rings, shape: tuple[int, int], every: int = 1
+) -> NDArray[np.float32]:
+    """Return the accumulator (h, w, 2), real and imaginary part per cell.
+
+    Only each `every`-th edge point votes, with the weight of so many.
+    """
     height, width = np.int32(shape[0]), np.int32(shape[1])
     cells, at = np.zeros(2 * height * width, np.float32), np.empty(len(rings.radius), np.int32)
     half = np.float32(1 / CELL)
-    for k in range(len(edges.x)):
+    for k in range(0, len(edges.x), every):
         x, y = (edges.x[k] + np.float32(0.5)) * half, (edges.y[k] + np.float32(0.5)) * half
-        dx, dy, weight = edges.nx[k] * half, edges.ny[k] * half, edges.weight[k]
+        dx, dy, weight = edges.nx[k] * half, edges.ny[k] * half, np.float32(every) * edges.weight[k]
         for j in range(len(at)):  # all cells of a ray first, which SIMD does
             u, v = x + rings.radius[j] * dx, y + rings.radius[j] * dy
             inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from scipy.spatial import cKDTree
 
 from mushpipe import RgbdFrame
 from mushpipe.core.errors import UsageError
@@ -75,13 +77,33 @@ def test_a_range_of_larger_caps_is_met_by_scaling_the_image() -> None:
     assert np.median(ratio) == pytest.approx(1, rel=0.04)
 
 
+def test_beside_depth_the_image_is_scaled_and_the_answer_scaled_back() -> None:
+    """Caps stay where they are; without depth the whole image is looked at."""
+    frame, truth = first("first-bed"), truth_of("first-bed")
+    whole, scaled = CapNet(), CapNet(beside_depth=0.8)
+    bare = replace(frame, depth=None)
+    (mask, circles), (same, others) = whole.process(frame), scaled.process(bare)
+    assert np.array_equal(mask.foreground, same.foreground)
+    assert np.array_equal(circles.center, others.center)
+    smaller, found = scaled.process(frame)
+    assert not np.array_equal(found.score, circles.score)
+    assert iou(smaller.foreground, mask.foreground) > 0.95
+    nearest = cKDTree(truth.center).query(found.center)[1]
+    off = found.center - truth.center[nearest]
+    assert np.abs(np.median(off, axis=0)).max() < 0.3  # px; no shift
+    assert np.median(found.radius / truth.radius[nearest]) == pytest.approx(1, abs=0.03)
+
+
 @pytest.mark.parametrize("shape", [(1, 1), (5, 70), (33, 65), (130, 31), (240, 320)])
 def test_an_image_of_any_size_gives_a_mask_of_its_size(shape: tuple[int, int]) -> None:
     noise = np.random.default_rng(1).integers(0, 256, (*shape, 3), np.uint8)
-    mask, circles = CapNet(min_score=0.0).process(RgbdFrame(HEADER, noise))
-    assert mask.foreground.shape == shape
-    assert (circles.center >= -0.5).all()
-    assert (circles.center < np.array(shape[::-1]) - 0.5).all()
+    frame = RgbdFrame(HEADER, noise)
+    deep = replace(frame, depth=np.full(shape, 4000, np.uint16), depth_scale=1.25e-4)
+    for seen in (frame, deep):
+        mask, circles = CapNet(min_score=0.0, beside_depth=0.7).process(seen)
+        assert mask.foreground.shape == shape
+        assert (circles.center >= -0.5).all()
+        assert (circles.center < np.array(shape[::-1]) - 0.5).all()
 
 
 def test_an_empty_bed_has_no_caps() -> None:

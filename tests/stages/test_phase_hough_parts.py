@@ -94,10 +94,13 @@ def test_phases_of_the_smallest_and_largest_radius_leave_a_gap() -> None:
     assert low == pytest.approx(-high)
 
 
+@pytest.mark.parametrize("every", [1, 2])
 @pytest.mark.parametrize("radius", [9.0, 17.0, 34.0])
-def test_the_peak_of_a_full_circle_is_about_one_and_its_phase_the_radius(radius: float) -> None:
+def test_the_peak_of_a_full_circle_is_about_one_and_its_phase_the_radius(
+    radius: float, every: int
+) -> None:
     found = edges(discs([(80, 60, radius)], 0.8, 0.1))
-    total, size = summed(vote(found, rings_between(8, 38), (60, 80)))
+    total, size = summed(vote(found, rings_between(8, 38), (60, 80), every))
     best = max(peaks(total, size, 0.2, 8, 38, 3).tolist(), key=lambda peak: peak[3])
     assert best[:3] == pytest.approx([80, 60, radius], abs=1.2)
     assert 0.6 < best[3] < 1.4

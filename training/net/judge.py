@@ -23,8 +23,9 @@ from training.field import RANGES, labelled, result
 from training.matching import Score, counted
 from training.net.scenes import CHOOSING_SEED, JUDGING_SEED, varied_cases
 from training.scenes import Case, choosing_cases, judging_cases
-from training.verifier import NET, RADII, segmentations
+from training.verifier import RADII, segmentations
 
+NET = CapNet(radius_px=RADII, min_score=0.05, beside_depth=0.8)  # as in graphs/pick.yaml
 CLASSIC = {
     "image": PhaseHough(radius_px=RADII, use_depth=False),
     "depth": PhaseHough(radius_px=RADII),
@@ -56,21 +57,19 @@ def simulated(models: list[Path], cases: Iterator[Case], peers: bool) -> str:
         for name, net in nets.items():
             scores[case.condition, name].add(net.process(case.frame)[1], case.truth, counts)
         if peers:
-            seen = {False: (*segmentations(case.frame)[0], None)}
-            seen[True] = (case.frame, *NET.process(case.frame))
-            for name, stage in CLASSIC.items():
-                circles = stage.process(*seen[stage.use_learned])
-                scores[case.condition, name].add(circles, case.truth, counts)
-            for name, stage in FITTED.items():
+            flat = (*segmentations(case.frame)[0], None)
+            for name, stage in (CLASSIC | FITTED).items():
                 frame = case.frame if stage.use_depth else replace(case.frame, depth=None)
-                circles = judge.kept(frame, stage.process(*seen[stage.use_learned]))
+                ready = (frame, *NET.process(frame)) if stage.use_learned else flat
+                circles = stage.process(*ready)
+                circles = judge.kept(frame, circles) if name in FITTED else circles
                 scores[case.condition, name].add(circles, case.truth, counts)
     return judge.table(scores, [*nets, *((*CLASSIC, *FITTED) if peers else ())])
 
 
 def both(frame: RgbdFrame, depth: bool) -> Circles:
     """Return the circles of network and classic detector, as graphs/pick.yaml has them."""
-    net = CapNet(radius_px=(8, 60), min_score=0.05)
+    net = CapNet(radius_px=(8, 60), min_score=0.05, beside_depth=0.8)
     frame = frame if depth else replace(frame, depth=None)
     stage = PhaseHough(radius_px=(8, 80), min_score=judge.LEAST, use_learned=True)
     return judge.kept(frame, stage.process(frame, *net.process(frame)))
