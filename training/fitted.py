@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
@@ -45,9 +46,11 @@ HEAD = """\
 
 def detected(frame: RgbdFrame) -> Iterator[tuple[Circles, bool]]:
     """Yield the circles of the detector alone and beside the network, and whether with depth."""
-    alone, beside = segmentations(frame)[0], (frame, *NET.process(frame))
+    alone, bare = segmentations(frame)[0], replace(frame, depth=None)
+    beside = {deep: (seen, *NET.process(seen)) for deep, seen in ((True, frame), (False, bare))}
     for stage in STAGES:
-        yield stage.process(*(beside if stage.use_learned else alone)), stage.use_depth
+        ready = beside[stage.use_depth] if stage.use_learned else alone
+        yield stage.process(*ready), stage.use_depth
 
 
 def labels(circles: Circles, truth: Truth) -> Floats:

@@ -48,7 +48,8 @@ Parts = dict[str, Floats]  # of a model, as in `verifier_net.Models`
 RADII = (8.0, 45.0)
 VARIED, FEW = 140, 20  # varied frames, and how many of them regressions learn from
 BETTER = 0.15  # of IoU; less gained nothing on scenes that chose nothing
-NET = CapNet(radius_px=RADII, min_score=0.05)  # what it is unsure of is for the verifier to decide
+# As in graphs/pick.yaml; what it is unsure of is for the verifier to decide.
+NET = CapNet(radius_px=RADII, min_score=0.05, beside_depth=0.8)
 RIDGE = 1e-3  # per candidate
 DECAY = 1e-4  # of a network's weights
 TEACHERS = 5
@@ -102,21 +103,23 @@ def segmentations(frame: RgbdFrame) -> list[tuple[RgbdFrame, Mask]]:
 def prepared(cache: Path) -> Iterator[Prepared]:
     """Yield the frames of the training, without and with the circles of `cap-net`.
 
-    Beside `cap-net` its mask takes the place of a segmentation. A network is surer of frames like
+    Beside `cap-net`, which has a look with depth and one without, its mask takes the place of a
+    segmentation. A network is surer of frames like
     those it was trained on than of any others, so each frame comes a second time with a `doubtful`
     one. And as real caps are not as clean as simulated ones, all of that comes once more on a
     `stained` frame and on a `harder` one.
     """
-    rng, other = np.random.default_rng(0), np.random.default_rng(1)
+    rng, other, deep = (np.random.default_rng(seed) for seed in range(3))
     varied = list(varied_cases(cache, VERIFIER_SEED, "a", VARIED))
     usual = [*training_cases(cache), *varied[:FEW]]
     for k, clean in enumerate([*usual, *more_cases(cache), *varied[FEW:]]):
         for case in (clean, stained(clean, other), harder(clean, other)):
             for frame, mask in segmentations(case.frame):
                 yield Prepared(case, frame, mask, None, k < len(usual))
-            mask, circles = NET.process(case.frame)
-            for found in (circles, doubtful(circles, rng)):
-                yield Prepared(case, case.frame, mask, found, k < len(usual))
+            for frame, doubt in ((replace(case.frame, depth=None), rng), (case.frame, deep)):
+                mask, circles = NET.process(frame)
+                for found in (circles, doubtful(circles, doubt)):
+                    yield Prepared(case, frame, mask, found, k < len(usual))
 
 
 def doubtful(circles: Circles, rng: np.random.Generator) -> Circles:
@@ -258,10 +261,10 @@ def teaches(case: Prepared, name: str) -> bool:
     A regression has a few dozen weights: what it learns from rare scenes it loses on usual ones.
     Without depth and network a varied bed teaches it little but doubt.
     """
-    if (case.learned is not None) != name.endswith("learned"):
+    deep, learned = name.startswith("depth"), name.endswith("learned")
+    if (case.learned is not None) != learned or (learned and deep == (case.frame.depth is None)):
         return False
-    varied = case.case.condition == "varied"
-    return name.startswith("depth") or (case.usual and (name == "image_learned" or not varied))
+    return deep or (case.usual and (learned or case.case.condition != "varied"))
 
 
 def main() -> None:

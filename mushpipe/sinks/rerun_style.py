@@ -68,10 +68,9 @@ def _draw_series(rec: Any, entity: str, lines: Mapping[str, tuple[int, int, int]
     """Draw series as lines with dots, so that a single frame shows as well."""
     import rerun as rr
 
-    names, colors = [*lines], [*lines.values()]
-    rec.log(entity, rr.SeriesLines(colors=colors, names=names), static=True)
-    sizes = [3] * len(names)
-    rec.log(entity, rr.SeriesPoints(colors=colors, marker_sizes=sizes), static=True)
+    style: dict[str, Any] = {"names": [*lines], "colors": [*lines.values()]}
+    rec.log(entity, rr.SeriesLines(**style), static=True)
+    rec.log(entity, rr.SeriesPoints(**style, marker_sizes=[3] * len(lines)), static=True)
 
 
 def _draw_space(rec: Any, place: str) -> None:

@@ -241,7 +241,8 @@ def test_counts_and_times_are_plotted(tmp_path: Path) -> None:
     }
     for plot, (names, expected) in lines.items():
         assert [row for row in values(found, plot, "scalars") if row] == [expected] * 2
-        assert [row for row in values(found, plot, "names") if row] == [names]
+        for style in ("SeriesLines", "SeriesPoints"):
+            assert [row for row in found[plot][f"{style}:names"] if row] == [names]
 
 
 def test_a_stage_without_a_time_leaves_a_gap_in_its_own_line(tmp_path: Path) -> None:

@@ -23,9 +23,8 @@ from training.field import RANGES, labelled, result
 from training.matching import Score, counted
 from training.net.scenes import CHOOSING_SEED, JUDGING_SEED, varied_cases
 from training.scenes import Case, choosing_cases, judging_cases
-from training.verifier import RADII, segmentations
+from training.verifier import NET, RADII, segmentations
 
-NET = CapNet(radius_px=RADII, min_score=0.05, beside_depth=0.8)  # as in graphs/pick.yaml
 CLASSIC = {
     "image": PhaseHough(radius_px=RADII, use_depth=False),
     "depth": PhaseHough(radius_px=RADII),
