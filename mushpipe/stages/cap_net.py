@@ -117,7 +117,8 @@ class CapNet(Stage):
         # the maps reach beyond the image, to whole blocks
         reach = np.rint(STRIDE * ratio * maps.shape[:0:-1]).astype(int).tolist()
         cap = resized(maps[MASK], (max(width, reach[0]), max(height, reach[1])))
-        return Mask(cap[:height, :width] > 0), Circles(circles[keep, :2], circles[keep, 2], score[keep])
+        found = Circles(circles[keep, :2], circles[keep, 2], score[keep])
+        return Mask(cap[:height, :width] > 0), found
 
     def scale(self) -> float:
         """Return by how much the image is scaled to bring the range of radii to the known ones."""
