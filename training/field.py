@@ -48,16 +48,21 @@ def labelled(labels: dict[str, Any], stamp_ns: int) -> tuple[Floats, Floats] | N
     return np.array(must).reshape(-1, 3), np.array(may).reshape(-1, 3)
 
 
-def result(circles: Circles, must: Floats, may: Floats) -> str:
-    """Return what was found, missed and false as text."""
+def found_and_false(circles: Circles, must: Floats, may: Floats) -> tuple[int, int]:
+    """Return how many of the circles (N, 3) that must be found are, and how many others are."""
     from scipy.optimize import linear_sum_assignment
 
     iou = circle_iou(circles.center, circles.radius, must[:, :2], must[:, 2])
     rows, columns = linear_sum_assignment(np.where(iou >= IOU, -iou, 1.0))
-    right = int((iou[rows, columns] >= IOU).sum())
-    left = np.setdiff1d(np.arange(len(circles)), rows[iou[rows, columns] >= IOU])
+    good = iou[rows, columns] >= IOU
+    left = np.setdiff1d(np.arange(len(circles)), rows[good])
     away = np.linalg.norm(circles.center[left][:, None] - may[None, :, :2], axis=2)
-    false = int((~(away <= may[None, :, 2]).any(axis=1)).sum())
+    return int(good.sum()), int((~(away <= may[None, :, 2]).any(axis=1)).sum())
+
+
+def result(circles: Circles, must: Floats, may: Floats) -> str:
+    """Return what was found, missed and false as text."""
+    right, false = found_and_false(circles, must, may)
     f = 2 * right / max(1, right + len(must) + false)
     on_cap = [bool((np.hypot(*(circles.center - m[:2]).T) < m[2]).any()) for m in must]
     return f"{right} of {len(must)}, false {false}, F {f:.3f}; on a cap {sum(on_cap)}"
