@@ -168,11 +168,12 @@ def cases(folder: Path) -> Iterator[tuple[str, Labelled]]:
                 yield f"{path.stem} #{frame.header.sequence}", Labelled(frame, *wanted)
 
 
-def judged(case: Labelled, beside_depth: float) -> str:
-    """Return a table of what is found of a frame in all alterations, and the sum."""
+def table(title: str, case: Labelled, beside_depth: float) -> str:
+    """Return what is found of a frame in all alterations, without and with depth, and the sum."""
     kinds = (False, True) if case.frame.depth is not None else (False,)
     totals = np.zeros((2, 3), int)
-    lines = []
+    heads = ["colour", "depth"][: len(kinds)]
+    lines = [f"| {title} | {' | '.join(heads)} |", "|---" * (1 + len(kinds)) + "|"]
     for name, (frame, must, may) in alterations(case):
         cells = []
         for deep in kinds:
@@ -192,7 +193,7 @@ def main() -> None:
     parser.add_argument("--beside-depth", type=float, default=0.8, help="setting of cap-net")
     arguments = parser.parse_args()
     for name, case in cases(arguments.folder):
-        print(f"\n| {name} | colour | depth |\n{judged(case, arguments.beside_depth)}", flush=True)
+        print(f"\n{table(name, case, arguments.beside_depth)}", flush=True)
 
 
 if __name__ == "__main__":

@@ -42,7 +42,7 @@ _TOP = 64.0  # gray levels per px; larger gradients count as this in Otsu's thre
 _AROUND = np.ones((7, 7), np.uint8)  # edges are taken so far around the foreground
 _STANDING = 0.004  # m; what is higher than this over the bed is looked at, in the mask or not
 _EVIDENCE = 0.07  # share of an outline that votes; half-hidden caps show hardly more
-_BESIDE = 0.14  # the same beside a network: what has less it sees as well, and fewer cost less time
+_BESIDE = 0.2  # the same beside a network: what has less it sees as well, and fewer cost less time
 _EVERY = 2  # edge points; of so many one votes where network and depth bring candidates as well
 _REACH = 2  # cells around a peak within which it must be the highest
 _SEEN = 0.25  # of `learned`; without depth, what the network sees less of is no cap
@@ -104,7 +104,7 @@ class PhaseHough(Stage):
     evidence: Annotated[float, Field(ge=0.01, le=1)] | None = Field(
         None,
         description="least share of an outline that votes, for a candidate; not set: 0.07, and "
-        "0.14 with use_learned, where circles of the network are candidates as well",
+        "0.2 with use_learned, where circles of the network are candidates as well",
     )
     use_depth: bool = Field(True, description="false ignores depth")
     use_blobs: bool = Field(
