@@ -6,10 +6,14 @@ import errno
 import os
 import sys
 from collections.abc import Mapping
+from functools import partial
 from io import FileIO
 from pathlib import Path
+from types import SimpleNamespace
 from typing import IO, Any, Literal, cast
 
+import mcap.writer
+import zstandard
 from mcap.writer import CompressionType, IndexType, Writer
 
 from mushpipe.core import wire
@@ -17,6 +21,13 @@ from mushpipe.core.errors import MushpipeError, UsageError
 from mushpipe.core.geometry import Camera
 from mushpipe.core.paths import STDIO
 from mushpipe.core.types import Header, RgbdFrame
+
+# mcap's writer has no setting for the level. At zstandard's own, 3, images take three times as long
+# and come out a sixth smaller.
+_LEVEL = 1
+mcap.writer.zstandard = SimpleNamespace(  # type: ignore[assignment, attr-defined]
+    compress=partial(zstandard.compress, level=_LEVEL)
+)
 
 
 class RecordingError(MushpipeError):

@@ -36,7 +36,7 @@ class McapSink(Sink):
         None, ge=1, le=100, description="store colour as JPEG of this quality; lossless if not set"
     )
     compression: Literal["zstd", "lz4"] = Field(
-        "zstd", description="lz4 takes a third of the time and half as much room again"
+        "zstd", description="lz4 takes two thirds of the time and a third more room"
     )
     drawings: bool = Field(
         True, description="record how viewers draw circles and picks, beside the tables"
