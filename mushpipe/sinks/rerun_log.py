@@ -1,6 +1,6 @@
 """What is written to Rerun of one frame: images, results in the image and in space, plots, log.
 
-Sixteen messages a frame, made in Python: so each has what is of this frame and nothing else (how it
+A dozen messages a frame, made in Python: so each has what is of this frame and nothing else (how it
 looks is told once, in `rerun_style`), and colours are packed as Rerun stores them.
 """
 

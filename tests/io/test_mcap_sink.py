@@ -11,8 +11,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import zstandard
 from mcap.reader import make_reader
-from mcap.records import Channel, Message, Metadata
+from mcap.records import Channel, Chunk, Message, Metadata
 from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory
 
@@ -135,6 +136,17 @@ def test_only_images_that_a_stage_made_are_recorded(tmp_path: Path) -> None:
     assert set(by_topic(given)) == topics - made
     few = record(tmp_path / "few.mcap", [trace], frames=False)
     assert set(by_topic(few)) == {"/mushpipe/timing"}
+
+
+def test_chunks_are_compressed_at_the_fastest_usual_level(tmp_path: Path) -> None:
+    """mcap's writer has no setting for it: this fails if it no longer calls what it is given."""
+    path = record(tmp_path / "run.mcap", [trace_of(make_frame(i)) for i in range(3)])
+    with path.open("rb") as file:
+        records = StreamReader(file, emit_chunks=True).records
+        chunks = [each for each in records if isinstance(each, Chunk)]
+    raw = [zstandard.decompress(chunk.data, chunk.uncompressed_size) for chunk in chunks]
+    assert [chunk.data for chunk in chunks] == [zstandard.compress(data, level=1) for data in raw]
+    assert [chunk.data for chunk in chunks] != [zstandard.compress(data) for data in raw]
 
 
 def test_lz4_holds_the_same(tmp_path: Path) -> None:
