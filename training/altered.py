@@ -8,9 +8,9 @@ what is found then says more, and is to change little.
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import starmap
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe import RgbdFrame
-from mushpipe.sources.mcap import McapSource
-from training.field import found_and_false, labelled
+from training.field import found_and_false, labelled_frames
 from training.matching import Floats
 from training.net.judge import both
 
@@ -159,13 +158,9 @@ def alterations(case: Labelled) -> Iterator[tuple[str, Labelled]]:
 def cases(folder: Path) -> Iterator[tuple[str, Labelled]]:
     """Yield the labelled frames of the recordings in a folder that show caps."""
     for path in sorted(folder.glob("*.mcap")):
-        labels = json.loads(path.with_suffix(".labels.json").read_text())
-        source = McapSource(path=path)
-        source.open()
-        for frame in source.frames():
-            wanted = labelled(labels, frame.header.stamp_ns)
-            if wanted is not None and len(wanted[0]):
-                yield f"{path.stem} #{frame.header.sequence}", Labelled(frame, *wanted)
+        for case in starmap(Labelled, labelled_frames(path)):
+            if len(case.must):
+                yield f"{path.stem} #{case.frame.header.sequence}", case
 
 
 def table(title: str, case: Labelled, beside_depth: float) -> str:

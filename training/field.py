@@ -48,6 +48,17 @@ def labelled(labels: dict[str, Any], stamp_ns: int) -> tuple[Floats, Floats] | N
     return np.array(must).reshape(-1, 3), np.array(may).reshape(-1, 3)
 
 
+def labelled_frames(path: Path) -> Iterator[tuple[RgbdFrame, Floats, Floats]]:
+    """Yield the frames of a recording that have labels beside it, with these as by `labelled`."""
+    labels = json.loads(path.with_suffix(".labels.json").read_text())
+    source = McapSource(path=path)
+    source.open()
+    for frame in source.frames():
+        wanted = labelled(labels, frame.header.stamp_ns)
+        if wanted is not None:
+            yield frame, *wanted
+
+
 def found_and_false(circles: Circles, must: Floats, may: Floats) -> tuple[int, int]:
     """Return how many of the circles (N, 3) that must be found are, and how many others are."""
     from scipy.optimize import linear_sum_assignment
@@ -70,14 +81,8 @@ def result(circles: Circles, must: Floats, may: Floats) -> str:
 
 def judge(path: Path) -> Iterator[str]:
     """Yield a line per labelled frame, segmentation and use of depth."""
-    labels = json.loads(path.with_suffix(".labels.json").read_text())
     settings = next(v for k, v in RANGES.items() if path.stem.startswith(k))
-    source = McapSource(path=path)
-    source.open()
-    for frame in source.frames():
-        wanted = labelled(labels, frame.header.stamp_ns)
-        if wanted is None:
-            continue
+    for frame, *wanted in labelled_frames(path):
         for name, (ready, mask) in zip(("flat", "plain"), segmentations(frame), strict=True):
             for kind in ("depth", "fitted", "image") if frame.depth is not None else ("image",):
                 text = result(detect(ready, mask, settings, kind), *wanted)

@@ -14,15 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe import Camera, Circles, Header, Mask, PickFlag, Picks, RgbdFrame, Trace
-from mushpipe.core.scene import (
-    CORNER,
-    DOME,
-    SOURCE_COLORS,
-    in_order,
-    labels,
-    posed,
-    tints,
-)
+from mushpipe.core.scene import CORNER, DOME, SOURCE_COLORS, in_order, labels, posed, tints
 from mushpipe.core.transform import Transform
 from mushpipe.core.wire import jpeg
 from mushpipe.sinks import rerun_layout as at

@@ -63,6 +63,14 @@ def consume(sink: RobotJsonSink, stamp_ns: int, arrival_ns: int = 0, spent_s: fl
     sink.consume(make_picks(), Trace(frame_at(stamp_ns, arrival_ns), {}, {}, left_ns))
 
 
+def live_clock(sink: RobotJsonSink) -> FakeClock:
+    """Open the sink for a live run, and return its clock."""
+    sink.open(LIVE)
+    clock = sink._clock
+    assert isinstance(clock, FakeClock)
+    return clock
+
+
 def ages(sink: RobotJsonSink, *frame: Any) -> int | None:
     """Return the age in ms of a frame that was just consumed, None where it is unknown."""
     consume(sink, *frame)
@@ -171,9 +179,7 @@ def test_a_port_that_is_taken(sink: RobotJsonSink) -> None:
 
 
 def test_an_age_counts_from_the_camera_on_the_monotonic_clock(sink: RobotJsonSink) -> None:
-    sink.open(LIVE)
-    clock = sink._clock
-    assert isinstance(clock, FakeClock)
+    clock = live_clock(sink)
     stamp = clock.wall_ns()
     clock.now += 0.1
     assert ages(sink, stamp, stamp + 30_000_000) == 100
@@ -202,9 +208,7 @@ def sensor_at(stamp_ns: int, domain: Domain) -> dict[str, SensorClock]:
 
 @pytest.mark.parametrize("domain", Domain)
 def test_a_picture_that_waited_in_the_camera_is_old(sink: RobotJsonSink, domain: Domain) -> None:
-    sink.open(LIVE)
-    clock = sink._clock
-    assert isinstance(clock, FakeClock)
+    clock = live_clock(sink)
     for waited in (0.0, 0.1, 3.0):
         stamp = clock.wall_ns()
         clock.now += waited
@@ -215,9 +219,7 @@ def test_a_picture_that_waited_in_the_camera_is_old(sink: RobotJsonSink, domain:
 
 def test_the_cameras_clock_counts_at_the_other_end_of_a_stream(sink: RobotJsonSink) -> None:
     """Slow by a second against the host, which is less than what tells one clock from another."""
-    sink.open(LIVE)
-    clock = sink._clock
-    assert isinstance(clock, FakeClock)
+    clock = live_clock(sink)
     for pause, slow, waited in ((1, 0.0, 0.0), (5000, 0.5, 0.0), (5000, 1.0, 0.0), (1, 1.0, 0.3)):
         clock.now += pause
         stamp = clock.wall_ns() - round(slow * 1e9)
@@ -233,9 +235,7 @@ def test_the_cameras_clock_counts_at_the_other_end_of_a_stream(sink: RobotJsonSi
 def test_a_clock_that_is_set_makes_targets_old_for_seconds_alone(
     sink: RobotJsonSink, jump: float
 ) -> None:
-    sink.open(LIVE)
-    clock = sink._clock
-    assert isinstance(clock, FakeClock)
+    clock = live_clock(sink)
     own, ages_ms, first = 0.0, [], clock.wall_ns()
     for number in range(300):  # a minute
         clock.now += 0.2
@@ -251,9 +251,7 @@ def test_a_clock_that_is_set_makes_targets_old_for_seconds_alone(
 def test_a_picture_of_a_camera_that_says_nothing_of_its_clock_is_old_where_it_waited(
     sink: RobotJsonSink, off_s: float
 ) -> None:
-    sink.open(LIVE)
-    clock = sink._clock
-    assert isinstance(clock, FakeClock)
+    clock = live_clock(sink)
     for waited in (0.0, 0.3, 1.9, 2.5, 6.0, 30.0, 61.0, 300.0):
         clock.now += 10
         stamp = clock.wall_ns() - round(off_s * 1e9)
@@ -267,9 +265,7 @@ def test_a_clock_that_is_set_costs_a_camera_with_a_clock_of_its_own_nothing(
     sink: RobotJsonSink, jump: float
 ) -> None:
     """Its stamps began near the host's and go on by themselves."""
-    sink.open(LIVE)
-    clock = sink._clock
-    assert isinstance(clock, FakeClock)
+    clock = live_clock(sink)
     stamp, found = clock.wall_ns(), []
     for number in range(300):
         clock.now += 0.2
@@ -281,9 +277,7 @@ def test_a_clock_that_is_set_costs_a_camera_with_a_clock_of_its_own_nothing(
 
 def test_what_a_frame_waits_in_a_stream_counts_once(sink: RobotJsonSink) -> None:
     """Between its arrival at the sender's host and this program."""
-    sink.open(LIVE)
-    clock = sink._clock
-    assert isinstance(clock, FakeClock)
+    clock = live_clock(sink)
     for waited in (0.0, 0.1, 0.3):
         clock.now += 1
         stamp = clock.wall_ns()

@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
@@ -15,11 +14,10 @@ from itertools import chain
 from pathlib import Path
 
 from mushpipe import Circles, RgbdFrame
-from mushpipe.sources.mcap import McapSource
 from mushpipe.stages.cap_net import CapNet
 from mushpipe.stages.phase_hough import PhaseHough
 from training import judge
-from training.field import RANGES, labelled, result
+from training.field import RANGES, labelled_frames, result
 from training.matching import Score, counted
 from training.net.scenes import CHOOSING_SEED, JUDGING_SEED, varied_cases
 from training.scenes import Case, choosing_cases, judging_cases
@@ -77,19 +75,14 @@ def both(frame: RgbdFrame, depth: bool, beside_depth: float = 0.8) -> Circles:
 def real(model: Path, folder: Path) -> Iterator[str]:
     """Yield lines per labelled frame of the recordings in a folder: the network, and both."""
     for path in sorted(folder.glob("*.mcap")):
-        labels = json.loads(path.with_suffix(".labels.json").read_text())
         radius = next(v for k, v in RANGES.items() if path.stem.startswith(k))["radius_px"]
         net = CapNet(radius_px=radius or (15, 90), model=model)
-        source = McapSource(path=path)
-        source.open()
-        for frame in source.frames():
-            wanted = labelled(labels, frame.header.stamp_ns)
-            if wanted is not None:
-                name = f"{path.stem:18} #{frame.header.sequence}"
-                yield f"{name} cap-net      {result(net.process(frame)[1], *wanted)}"
-                yield f"{name} both, colour {result(both(frame, False), *wanted)}"
-                if frame.depth is not None:
-                    yield f"{name} both, depth  {result(both(frame, True), *wanted)}"
+        for frame, *wanted in labelled_frames(path):
+            name = f"{path.stem:18} #{frame.header.sequence}"
+            yield f"{name} cap-net      {result(net.process(frame)[1], *wanted)}"
+            yield f"{name} both, colour {result(both(frame, False), *wanted)}"
+            if frame.depth is not None:
+                yield f"{name} both, depth  {result(both(frame, True), *wanted)}"
 
 
 def main() -> None:
