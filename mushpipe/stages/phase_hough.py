@@ -26,7 +26,7 @@ from mushpipe.stages.phase_edges import (
 )
 from mushpipe.stages.phase_features import LEARNED, NAMES, static_features
 from mushpipe.stages.phase_fuse import fused
-from mushpipe.stages.phase_learned import add_discs, agreement, candidates_of
+from mushpipe.stages.phase_learned import add_discs, agreement, candidates_of, with_bare, within
 from mushpipe.stages.phase_polish import polish
 from mushpipe.stages.phase_refit import Table, refit
 from mushpipe.stages.phase_strips import Strips, in_strips
@@ -46,6 +46,7 @@ _BESIDE = 0.2  # the same beside a network: what has less it sees as well, and f
 _EVERY = 2  # edge points; of so many one votes where network and depth bring candidates as well
 _REACH = 2  # cells around a peak within which it must be the highest
 _SEEN = 0.25  # of `learned`; without depth, what the network sees less of is no cap
+_SURE = 0.8  # of a network's circle, from which on it is taken for a cap though it has no outline
 _LIKELY = 0.5  # score from which on a circle is more likely a cap than not
 _SMALLEST = 12  # px; images smaller than this in either direction hold no circle
 
@@ -63,6 +64,7 @@ class Evidence:
         height: (h, w) m over the bed at half resolution, empty without depth.
         pixel: Size of a pixel on the bed, m.
         range: Smallest and largest radius, px.
+        learned: Circles of the network within the range; None without.
     """
 
     edges: Strips
@@ -73,6 +75,7 @@ class Evidence:
     height: Plane
     pixel: float
     range: tuple[float, float]
+    learned: Circles | None
 
 
 class PhaseHough(Stage):
@@ -156,7 +159,12 @@ class PhaseHough(Stage):
         score[after] = np.minimum.accumulate(score[after])
         owner[np.isin(owner, np.flatnonzero(after))] = -1
         polish(found.edges, found.height, found.pixel, shapes, owner, *found.range)
-        return Circles(shapes[:, :2], equal_area_radius(shapes), score)
+        circles = Circles(shapes[:, :2], equal_area_radius(shapes), score)
+        if found.learned is None:
+            return circles
+        sure = found.learned.take(found.learned.score >= max(_SURE, self.min_score))
+        radius = equal_area_radius(found.shapes)
+        return with_bare(circles, sure, found.shapes, radius, order[score >= _LIKELY])
 
     def gather(
         self, frame: RgbdFrame, mask: Mask, learned: Circles | None = None
@@ -199,7 +207,8 @@ class PhaseHough(Stage):
             kept &= np.isfinite(middle) | (table[:, NAMES.index(LEARNED)] >= _SEEN)
         limits = (smallest, largest)
         parts = (shapes[kept], hits[kept], table[kept], middle[kept])
-        return Evidence(edges, *parts, high, pixel, limits)
+        known = None if learned is None else within(learned, *limits)
+        return Evidence(edges, *parts, high, pixel, limits, known)
 
     def decide(self, found: Evidence) -> tuple[Rows, Table, Rows]:
         """Return the accepted rows in their order, all probabilities, and whose each edge is."""

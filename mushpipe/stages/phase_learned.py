@@ -9,18 +9,25 @@ from numpy.typing import NDArray
 
 from mushpipe import Circles
 from mushpipe.core.jit import borrower, jit
-from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE, iou
-from mushpipe.stages.phase_edges import Plane
+from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE, iou, lens
+from mushpipe.stages.phase_edges import Plane, Rows
 from mushpipe.stages.phase_refit import Table
 
 _AROUND = 4.0  # px; a circle of a network is not more exact than that
+_SAME = 0.5  # IoU from which on an outline is that of a circle
+_OWN = 0.5  # share of a circle that none that was accepted may cover
+
+
+def within(learned: Circles, smallest: float, largest: float) -> Circles:
+    """Return the circles of a radius (px) within the range, or a tenth beyond."""
+    enough = learned.radius >= LEAST_OF_RANGE * smallest
+    return learned.take(enough & (learned.radius <= MOST_OF_RANGE * largest))
 
 
 def candidates_of(learned: Circles, smallest: float, largest: float) -> Plane:
     """Return circles as candidates (N, 4) for a refit: those of a radius (px) within the range."""
-    rows = np.column_stack([learned.center, learned.radius, learned.score]).astype(np.float32)
-    enough = learned.radius >= LEAST_OF_RANGE * smallest
-    return np.asarray(rows[enough & (learned.radius <= MOST_OF_RANGE * largest)])
+    known = within(learned, smallest, largest)
+    return np.column_stack([known.center, known.radius, known.score]).astype(np.float32)
 
 
 def add_discs(learned: Circles, foreground: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -36,6 +43,47 @@ def agreement(shapes: Table, radius: Table, learned: Circles) -> Table:
     The largest score of a circle, times its IoU with the outline's circle.
     """
     return _agreement(shapes, radius, learned.center, learned.radius, learned.score)
+
+
+def with_bare(
+    circles: Circles, sure: Circles, shapes: Table, radius: Table, likely: Rows
+) -> Circles:
+    """Return the accepted circles, and sure ones of a network that no outline was found of.
+
+    Beside something bright the edges of a dim cap may count as none. Where there is an outline, it
+    is for the verifier to say what it is.
+
+    Args:
+        circles: Those accepted, the most certain first.
+        sure: Those of the network, of a radius within the range.
+        shapes: (N, 5) outlines that were found.
+        radius: (N,) of their circles.
+        likely: Rows of those that are more likely caps than not.
+    """
+    taken = np.zeros(len(shapes), np.bool_)
+    taken[likely] = True
+    more = sure.take(_bare(sure.center, sure.radius, shapes, radius, taken))
+    score = np.append(circles.score, more.score)
+    first = np.argsort(-score, kind="stable")
+    center = np.concatenate([circles.center, more.center])
+    return Circles(center[first], np.append(circles.radius, more.radius)[first], score[first])
+
+
+@jit
+def _bare(
+    center: Table, of: Table, shapes: Table, radius: Table, taken: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    free = np.ones(len(center), np.bool_)
+    for m in range(len(center)):
+        own = math.pi * of[m] ** 2
+        for k in range(len(shapes)):
+            away = math.hypot(shapes[k, 0] - center[m, 0], shapes[k, 1] - center[m, 1])
+            if away < radius[k] + of[m]:
+                covered = taken[k] and lens(away, of[m], radius[k]) > _OWN * own
+                if covered or iou(away, of[m], radius[k]) >= _SAME:
+                    free[m] = False
+                    break
+    return free
 
 
 @borrower

@@ -5,7 +5,7 @@ import pytest
 
 from mushpipe import Circles, Mask, UsageError
 from mushpipe.stages.phase_hough import PhaseHough
-from mushpipe.stages.phase_learned import add_discs, agreement, candidates_of
+from mushpipe.stages.phase_learned import add_discs, agreement, candidates_of, with_bare
 from tests.stages.caps import cap, draw, frame_from
 from tests.stages.scenes import discs, frame_of
 
@@ -93,3 +93,42 @@ def test_without_depth_what_the_network_does_not_see_is_no_cap() -> None:
     assert len(stage.process(frame, mask, circles())) == 0
     seen = stage.process(frame, mask, circles((109, 61, 15, 0.6)))
     assert seen.center == pytest.approx(np.array([[110, 60]]), abs=0.5)
+
+
+def beside_a_lamp() -> np.ndarray:
+    """Two discs, one of them too dim beside the sheet on the right to have edges."""
+    image = np.maximum(discs([(40, 40, 15)], 0.6, 0.05), discs([(40, 90, 15)], 0.07, 0.05))
+    image[:, 110:] = 1
+    return image
+
+
+def test_a_sure_circle_without_an_outline_is_a_cap_and_one_that_is_not_sure_is_none() -> None:
+    image = beside_a_lamp()
+    frame, mask = frame_of(image), Mask(image < 0.9)
+    stage = PhaseHough(use_learned=True)
+    bright, dim = (40.5, 40.5, 15, 0.7), (40.0, 90.0, 15.0, 0.9)
+    found = stage.process(frame, mask, circles(bright, dim))
+    assert len(found) == 2
+    assert found.center[found.score == 0.9] == pytest.approx(np.array([[40, 90]]))
+    assert (np.diff(found.score) <= 0).all()
+    assert len(stage.process(frame, mask, circles(bright, (*dim[:3], 0.7)))) == 1
+    strict = PhaseHough(use_learned=True, min_score=0.95)
+    assert 0.9 not in strict.process(frame, mask, circles(bright, dim)).score
+    small = PhaseHough(use_learned=True, radius_px=(18, 30))
+    assert len(small.process(frame, mask, circles(dim))) == 0
+
+
+def test_circles_without_an_outline_come_from_nowhere_but_free_ground() -> None:
+    shapes = np.array([[50, 50, 20, 0, 0], [150, 50, 20, 0, 0]], float)
+    rows = [(50, 58, 20, 0.9), (50, 76, 12, 0.9), (50, 62, 8, 0.9), (150, 62, 8, 0.9)]
+    # shares of the circle within the first outline, and IoU, by counting points
+    v, u = np.mgrid[0:100:0.1, 0:200:0.1]
+    discs_ = [(u - x) ** 2 + (v - y) ** 2 <= r * r for x, y, r, _ in rows]
+    one = (u - 50) ** 2 + (v - 50) ** 2 <= 400
+    same = [(one & d).sum() / (one | d).sum() for d in discs_]
+    covered = [(one & d).sum() / d.sum() for d in discs_]
+    assert same[0] > 0.5
+    assert covered[1] < 0.5 < covered[2]
+    found = with_bare(circles(), circles(*rows), shapes, shapes[:, 2], np.array([0]))
+    # the last lies in an outline that was not accepted
+    assert found.center.tolist() == [[50, 76], [150, 62]]
