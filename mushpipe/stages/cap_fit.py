@@ -19,6 +19,7 @@ from mushpipe import (
 )
 from mushpipe.core.geometry import lengths
 from mushpipe.stages.cap_batch import Fits, fit_caps
+from mushpipe.stages.cap_clod import CLOD_CHANCE, clods
 from mushpipe.stages.cap_kin import FEWEST, unlike
 from mushpipe.stages.cap_order import Order, by_depth
 from mushpipe.stages.cap_solve import Noise
@@ -75,7 +76,7 @@ class CapFit(Stage):
         frame, circles = example_frame(), example_circles()
         self.process(frame, circles)
         if self.min_score is not None:
-            unlike(frame.color, circles.take(np.zeros(FEWEST, np.intp)))
+            self._scores(frame, circles.take(np.zeros(FEWEST, np.intp)))
 
     def process(self, frame: RgbdFrame, circles: Circles) -> tuple[Locations, Poses, Circles]:
         """Return one location and one pose per circle, and the circles, improved.
@@ -106,7 +107,8 @@ class CapFit(Stage):
     def _scores(self, frame: RgbdFrame, circles: Circles, fits: Fits | None = None) -> Floats:
         if self.min_score is None:
             return circles.score
-        return chances(circles, unlike(frame.color, circles), fits)
+        chance = chances(circles, unlike(frame.color, circles), fits)
+        return np.where(clods(frame.color, circles), np.minimum(chance, CLOD_CHANCE), chance)
 
     def _kept(
         self, locations: Locations, poses: Poses, circles: Circles

@@ -28,6 +28,7 @@ DARK = 4.0  # gray levels that are added, since the darkest ones are noise
 MOST = 6.0
 # Differences between caps of a kind: of the log of brightness, of red and blue over green.
 USUAL = np.array([0.2, 0.08, 0.08])
+UNIT = USUAL * np.sqrt(len(USUAL))
 KIN, PART = 3, 10  # so many sure caps like it, and one in so many of them, are its kind
 
 
@@ -45,17 +46,23 @@ def unlike(color: NDArray[np.uint8], circles: Circles) -> Floats:
     sure = np.flatnonzero(circles.score >= SURE)
     if len(sure) < FEWEST:
         return np.full(len(circles), np.nan)
+    nearest = max(KIN, -(-len(sure) // PART))
+    return np.minimum(distances(tones_of(color, circles), sure, nearest), MOST)
+
+
+def tones_of(color: NDArray[np.uint8], circles: Circles) -> Floats:
+    """Return log brightness, log red over green and log blue over green (N, 3), in usual units.
+
+    The distance of two tones is the root mean square of their differences in units of `USUAL`.
+    """
     tones = np.empty((len(circles), 3))
     # read-only as a frame's: to the compiler another type, and another kernel
     _tones(locked(color, np.uint8), discs_of(circles), tones)
-    tones /= USUAL * np.sqrt(len(USUAL))
-    nearest = max(KIN, -(-len(sure) // PART))
-    return np.minimum(_distances(tones, sure, nearest), MOST)
+    return np.asarray(tones / UNIT)
 
 
 @borrower
 def _tones(color: NDArray[np.uint8], discs: Floats, tones: Floats) -> None:
-    """Write log brightness, log red over green and log blue over green of each disc (N, 3)."""
     height, width = color.shape[:2]
     for k in range(len(discs)):
         x, y, radius = discs[k, 0] + 0.5, discs[k, 1] + 0.5, discs[k, 2]
@@ -66,13 +73,18 @@ def _tones(color: NDArray[np.uint8], discs: Floats, tones: Floats) -> None:
             red += color[v, u, 0]
             green += color[v, u, 1]
             blue += color[v, u, 2]
-        r, g = math.log(red / len(SAMPLES) + DARK), math.log(green / len(SAMPLES) + DARK)
-        b = math.log(blue / len(SAMPLES) + DARK)
-        tones[k, 0], tones[k, 1], tones[k, 2] = (r + g + b) / 3, r - g, b - g
+        write_tone(red / len(SAMPLES), green / len(SAMPLES), blue / len(SAMPLES), tones[k])
+
+
+@borrower
+def write_tone(red: float, green: float, blue: float, tone: Floats) -> None:
+    """Write log brightness, log red over green and log blue over green (3,) of gray levels."""
+    r, g, b = math.log(red + DARK), math.log(green + DARK), math.log(blue + DARK)
+    tone[0], tone[1], tone[2] = (r + g + b) / 3, r - g, b - g
 
 
 @jit
-def _distances(tones: Floats, sure: NDArray[np.int64], nearest: int) -> Floats:
+def distances(tones: Floats, sure: NDArray[np.int64], nearest: int) -> Floats:
     """Return how far each (N,) is from the so many nearest of the sure ones, itself aside."""
     found, least = np.empty(len(tones)), np.empty(nearest)  # the squares so far, in order
     for k in range(len(tones)):

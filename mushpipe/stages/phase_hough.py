@@ -160,7 +160,7 @@ class PhaseHough(Stage):
         owner[np.isin(owner, np.flatnonzero(after))] = -1
         polish(found.edges, found.height, found.pixel, shapes, owner, *found.range)
         circles = Circles(shapes[:, :2], equal_area_radius(shapes), score)
-        if found.learned is None:
+        if found.learned is None or len(found.height):
             return circles
         sure = found.learned.take(found.learned.score >= max(_SURE, self.min_score))
         radius = equal_area_radius(found.shapes)

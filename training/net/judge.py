@@ -42,7 +42,7 @@ def scenes(cache: Path, choosing: bool) -> Iterator[Case]:
     """Yield the frames to judge on, or those for choices of design."""
     if choosing:
         return chain(choosing_cases(cache), varied_cases(cache, CHOOSING_SEED, "a", 60))
-    return chain(judging_cases(cache), varied_cases(cache, JUDGING_SEED, "b", 16))
+    return chain(judging_cases(cache), varied_cases(cache, JUDGING_SEED, "b", 60))
 
 
 def simulated(models: list[Path], cases: Iterator[Case], peers: bool) -> str:

@@ -1,0 +1,89 @@
+"""What looks as the ground around it does, and not as most caps in view do, is a clod.
+
+A round clod may have the form of a cap, in the image and in depth, and a network that never saw
+such soil may be sure of it; several of them are then kin (`cap_kin`). But brown caps on brown soil
+look like each other, and white ones on mycelium do.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mushpipe import Circles
+from mushpipe.core.jit import borrower
+from mushpipe.core.tables import locked
+from mushpipe.stages.cap_kin import DARK, FEWEST, SURE, UNIT, distances, tones_of, write_tone
+from mushpipe.stages.discs import discs_of
+
+Floats = NDArray[np.float64]
+ODD = 1.5  # distance to the nearer half of the sure caps from which on it is none of them
+ALIKE = 1.0  # distance to the ground up to which it looks like it
+LIKELY = 0.5  # score from which on a circle may be a cap, and so is no ground
+# The ground is looked at from 1.3 to 1.9 radii, so far from all circles that shadows end.
+_TURNS, _REACH = 2 * np.pi * (np.arange(32) + 0.5) / 32, np.linspace(1.3, 1.9, 6)
+RING = np.stack([np.outer(_REACH, np.cos(_TURNS)), np.outer(_REACH, np.sin(_TURNS))], -1)
+RING = np.ascontiguousarray(RING.reshape(-1, 2))
+CLEAR = 1.15  # radii of a circle within which there is no ground
+LEAST = 20  # samples of the ground
+CLOD_CHANCE = 0.05  # of what is one; 3 of 70 on rendered frames that trained nothing were caps
+NIGHT = 16.0  # gray levels; darker ground looks like everything
+
+
+def clods(color: NDArray[np.uint8], circles: Circles) -> NDArray[np.bool_]:
+    """Return which circles (N,) look as the ground does and not as most sure caps do.
+
+    Nothing is one where fewer than `FEWEST` circles are sure, and where no ground is seen or it is
+    too dark to tell.
+
+    Args:
+        color: (H, W, 3) RGB.
+        circles: As detected, with the scores of `phase-hough`.
+    """
+    sure = np.flatnonzero(circles.score >= SURE)
+    if len(sure) < FEWEST:
+        return np.zeros(len(circles), np.bool_)
+    tones = tones_of(color, circles)
+    odd = distances(tones, sure, -(-len(sure) // 2)) > ODD
+    ground = np.full(tones.shape, np.nan)
+    discs, likely = discs_of(circles), circles.score >= LIKELY
+    _grounds(locked(color, np.uint8), discs, odd, likely, ground)
+    dark = ground[:, 0] < math.log(NIGHT + DARK)
+    away = np.linalg.norm(tones - ground / UNIT, axis=1)
+    return np.asarray(odd & ~dark & (away < ALIKE))
+
+
+@borrower
+def _grounds(
+    color: NDArray[np.uint8], discs: Floats, asked: NDArray[np.bool_], likely: NDArray[np.bool_],
+    ground: Floats,
+) -> None:  # fmt: skip
+    """Write the tone of the ground around the discs (N, 3) that are asked for, where it is seen."""
+    height, width = color.shape[:2]
+    for k in range(len(discs)):
+        if not asked[k]:
+            continue
+        red = green = blue = seen = 0
+        for s in range(len(RING)):
+            x, y = discs[k, 0] + discs[k, 2] * RING[s, 0], discs[k, 1] + discs[k, 2] * RING[s, 1]
+            u, v = math.floor(x + 0.5), math.floor(y + 0.5)
+            if 0 <= u < width and 0 <= v < height and _free(x, y, discs, likely):
+                red += color[v, u, 0]
+                green += color[v, u, 1]
+                blue += color[v, u, 2]
+                seen += 1
+        if seen >= LEAST:
+            write_tone(red / seen, green / seen, blue / seen, ground[k])
+
+
+@borrower
+def _free(x: float, y: float, discs: Floats, likely: NDArray[np.bool_]) -> bool:
+    """Whether a point lies in none of the discs that may be caps, nor close to one."""
+    for m in range(len(discs)):
+        if likely[m]:
+            near = (x - discs[m, 0]) ** 2 + (y - discs[m, 1]) ** 2 < (CLEAR * discs[m, 2]) ** 2
+            if near:
+                return False
+    return True
