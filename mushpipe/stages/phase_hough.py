@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, Literal, Self
 
 import cv2
@@ -259,7 +259,9 @@ class PhaseHough(Stage):
     def _warm_up(self) -> None:
         for native in (np.uint16, np.float32):
             frame = example_frame(native=native)
-            self.process(frame, Mask(frame.depth_m < 0.49), example_circles())
+            mask = Mask(frame.depth_m < 0.49)
+            self.process(frame, mask, example_circles())
+        self.process(replace(frame, depth=None), mask, example_circles())
 
 
 def equal_area_radius(shapes: Table) -> Table:
