@@ -28,7 +28,7 @@ RING = np.stack([np.outer(_REACH, np.cos(_TURNS)), np.outer(_REACH, np.sin(_TURN
 RING = np.ascontiguousarray(RING.reshape(-1, 2))
 CLEAR = 1.15  # radii of a circle within which there is no ground
 LEAST = 20  # samples of the ground
-CLOD_CHANCE = 0.05  # of what is one; 3 of 70 on rendered frames that trained nothing were caps
+CLOD_CHANCE = 0.05  # of what is one to be a cap; 1 of 68 was on another renderer's frames
 NIGHT = 16.0  # gray levels; darker ground looks like everything
 
 

@@ -50,8 +50,8 @@ def with_bare(
 ) -> Circles:
     """Return the accepted circles, and sure ones of a network that no outline was found of.
 
-    Beside something bright the edges of a dim cap may count as none. Where there is an outline, it
-    is for the verifier to say what it is.
+    The edges of a dark cap on bright ground face the wrong way, and those of a dim one beside
+    something bright may count as none. Where there is an outline, the verifier says what it is.
 
     Args:
         circles: Those accepted, the most certain first.
