@@ -20,7 +20,7 @@ from mushpipe import Circles, RgbdFrame
 from mushpipe.core.truth import Truth
 from mushpipe.evaluate.matching import circle_iou
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_kin import unlike
+from mushpipe.stages.cap_kin import kin_of, unlike
 from mushpipe.stages.cap_verify import FILE, FIT, MODELS, NAMES, features, flat
 from mushpipe.stages.phase_hough import PhaseHough
 from mushpipe.stages.verifier import LIMIT
@@ -76,7 +76,7 @@ def samples(cache: Path) -> tuple[Floats, Floats]:
                 use = np.isfinite(label := labels(circles, case.truth))
                 if fits is not None:
                     use &= fits.valid & ~flat(fits)
-                rows.append(features(circles, unlike(frame.color, circles), fits)[use])
+                rows.append(features(circles, unlike(kin_of(frame.color, circles)), fits)[use])
                 right.append(label[use])
     return np.concatenate(rows), np.concatenate(right)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mushpipe import Circles
 from mushpipe.core.jit import borrower
 from mushpipe.core.tables import locked
-from mushpipe.stages.cap_kin import DARK, FEWEST, SURE, UNIT, distances, tones_of, write_tone
+from mushpipe.stages.cap_kin import DARK, UNIT, Kin, distances, write_tone
 from mushpipe.stages.discs import discs_of
 
 Floats = NDArray[np.float64]
@@ -32,26 +32,25 @@ CLOD_CHANCE = 0.05  # of what is one to be a cap; 1 of 68 was on another rendere
 NIGHT = 16.0  # gray levels; darker ground looks like everything
 
 
-def clods(color: NDArray[np.uint8], circles: Circles) -> NDArray[np.bool_]:
+def clods(color: NDArray[np.uint8], circles: Circles, kin: Kin) -> NDArray[np.bool_]:
     """Return which circles (N,) look as the ground does and not as most sure caps do.
 
-    Nothing is one where fewer than `FEWEST` circles are sure, and where no ground is seen or it is
-    too dark to tell.
+    Nothing is one where few circles are sure, and where no ground is seen or it is too dark to
+    tell.
 
     Args:
         color: (H, W, 3) RGB.
         circles: As detected, with the scores of `phase-hough`.
+        kin: What they look like.
     """
-    sure = np.flatnonzero(circles.score >= SURE)
-    if len(sure) < FEWEST:
+    if not len(kin.sure):
         return np.zeros(len(circles), np.bool_)
-    tones = tones_of(color, circles)
-    odd = distances(tones, sure, -(-len(sure) // 2)) > ODD
-    ground = np.full(tones.shape, np.nan)
+    odd = distances(*kin, -(-len(kin.sure) // 2)) > ODD
+    ground = np.full(kin.tones.shape, np.nan)
     discs, likely = discs_of(circles), circles.score >= LIKELY
     _grounds(locked(color, np.uint8), discs, odd, likely, ground)
     dark = ground[:, 0] < math.log(NIGHT + DARK)
-    away = np.linalg.norm(tones - ground / UNIT, axis=1)
+    away = np.linalg.norm(kin.tones - ground / UNIT, axis=1)
     return np.asarray(odd & ~dark & (away < ALIKE))
 
 
@@ -82,8 +81,7 @@ def _grounds(
 def _free(x: float, y: float, discs: Floats, likely: NDArray[np.bool_]) -> bool:
     """Whether a point lies in none of the discs that may be caps, nor close to one."""
     for m in range(len(discs)):
-        if likely[m]:
-            near = (x - discs[m, 0]) ** 2 + (y - discs[m, 1]) ** 2 < (CLEAR * discs[m, 2]) ** 2
-            if near:
-                return False
+        squared = (x - discs[m, 0]) ** 2 + (y - discs[m, 1]) ** 2
+        if likely[m] and squared < (CLEAR * discs[m, 2]) ** 2:
+            return False
     return True

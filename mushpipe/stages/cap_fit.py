@@ -20,7 +20,7 @@ from mushpipe import (
 from mushpipe.core.geometry import lengths
 from mushpipe.stages.cap_batch import Fits, fit_caps
 from mushpipe.stages.cap_clod import CLOD_CHANCE, clods
-from mushpipe.stages.cap_kin import FEWEST, unlike
+from mushpipe.stages.cap_kin import FEWEST, kin_of, unlike
 from mushpipe.stages.cap_order import Order, by_depth
 from mushpipe.stages.cap_solve import Noise
 from mushpipe.stages.cap_verify import chances
@@ -107,8 +107,9 @@ class CapFit(Stage):
     def _scores(self, frame: RgbdFrame, circles: Circles, fits: Fits | None = None) -> Floats:
         if self.min_score is None:
             return circles.score
-        chance = chances(circles, unlike(frame.color, circles), fits)
-        return np.where(clods(frame.color, circles), np.minimum(chance, CLOD_CHANCE), chance)
+        kin = kin_of(frame.color, circles)
+        chance = chances(circles, unlike(kin), fits)
+        return np.where(clods(frame.color, circles, kin), np.minimum(chance, CLOD_CHANCE), chance)
 
     def _kept(
         self, locations: Locations, poses: Poses, circles: Circles

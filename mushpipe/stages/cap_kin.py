@@ -8,6 +8,7 @@ from bed to bed.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,12 +33,21 @@ UNIT = USUAL * np.sqrt(len(USUAL))
 KIN, PART = 3, 10  # so many sure caps like it, and one in so many of them, are its kind
 
 
-def unlike(color: NDArray[np.uint8], circles: Circles) -> Floats:
-    """Return how unlike each circle (N,) is to its kind, 0 to `MOST`; NaN where few are sure.
+class Kin(NamedTuple):
+    """What circles look like, and which of them tell what caps look like here.
 
-    Its distance to the `KIN`th nearest of the sure circles, or to the nearest tenth of them if
-    those are more: the root mean square over brightness, red over green and blue over green of the
-    differences of their logarithms, in units of `USUAL`.
+    Attributes:
+        tones: (N, 3) log brightness, log red over green and log blue over green, so that the
+            distance of two is the root mean square of their differences in units of `USUAL`.
+        sure: Rows of those that are surely caps; none where they are fewer than `FEWEST`.
+    """
+
+    tones: Floats
+    sure: NDArray[np.int64]
+
+
+def kin_of(color: NDArray[np.uint8], circles: Circles) -> Kin:
+    """Return what circles look like.
 
     Args:
         color: (H, W, 3) RGB.
@@ -45,20 +55,22 @@ def unlike(color: NDArray[np.uint8], circles: Circles) -> Floats:
     """
     sure = np.flatnonzero(circles.score >= SURE)
     if len(sure) < FEWEST:
-        return np.full(len(circles), np.nan)
-    nearest = max(KIN, -(-len(sure) // PART))
-    return np.minimum(distances(tones_of(color, circles), sure, nearest), MOST)
-
-
-def tones_of(color: NDArray[np.uint8], circles: Circles) -> Floats:
-    """Return log brightness, log red over green and log blue over green (N, 3), in usual units.
-
-    The distance of two tones is the root mean square of their differences in units of `USUAL`.
-    """
+        return Kin(np.full((len(circles), 3), np.nan), sure[:0])
     tones = np.empty((len(circles), 3))
     # read-only as a frame's: to the compiler another type, and another kernel
     _tones(locked(color, np.uint8), discs_of(circles), tones)
-    return np.asarray(tones / UNIT)
+    return Kin(np.asarray(tones / UNIT), sure)
+
+
+def unlike(kin: Kin) -> Floats:
+    """Return how unlike each circle (N,) is to its kind, 0 to `MOST`; NaN where few are sure.
+
+    Its distance to the `KIN`th nearest of the sure circles, or to the nearest tenth of them if
+    those are more.
+    """
+    if not len(kin.sure):
+        return np.full(len(kin.tones), np.nan)
+    return np.minimum(distances(*kin, max(KIN, -(-len(kin.sure) // PART))), MOST)
 
 
 @borrower

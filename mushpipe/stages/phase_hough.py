@@ -191,8 +191,9 @@ class PhaseHough(Stage):
         cells = vote(edges, rings_between(smallest, largest), size, every)
         evidence = self.evidence or (_EVIDENCE if learned is None else _BESIDE)
         found = peaks(*summed(cells), evidence, smallest, largest, _REACH)
-        if learned is not None:
-            found = np.concatenate([found, candidates_of(learned, smallest, largest)])
+        known = None if learned is None else within(learned, smallest, largest)
+        if known is not None:
+            found = np.concatenate([found, candidates_of(known)])
         if relief is not None and self.use_blobs:
             found = np.concatenate([found, blobs_of(relief, smallest, largest)])
         high, pixel = (relief.height, relief.pixel) if relief else (NO_RELIEF, 0.0)
@@ -207,7 +208,6 @@ class PhaseHough(Stage):
             kept &= np.isfinite(middle) | (table[:, NAMES.index(LEARNED)] >= _SEEN)
         limits = (smallest, largest)
         parts = (shapes[kept], hits[kept], table[kept], middle[kept])
-        known = None if learned is None else within(learned, *limits)
         return Evidence(edges, *parts, high, pixel, limits, known)
 
     def decide(self, found: Evidence) -> tuple[Rows, Table, Rows]:

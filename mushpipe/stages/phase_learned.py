@@ -24,10 +24,9 @@ def within(learned: Circles, smallest: float, largest: float) -> Circles:
     return learned.take(enough & (learned.radius <= MOST_OF_RANGE * largest))
 
 
-def candidates_of(learned: Circles, smallest: float, largest: float) -> Plane:
-    """Return circles as candidates (N, 4) for a refit: those of a radius (px) within the range."""
-    known = within(learned, smallest, largest)
-    return np.column_stack([known.center, known.radius, known.score]).astype(np.float32)
+def candidates_of(learned: Circles) -> Plane:
+    """Return circles as candidates (N, 4) for a refit."""
+    return np.column_stack([learned.center, learned.radius, learned.score]).astype(np.float32)
 
 
 def add_discs(learned: Circles, foreground: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from mushpipe import Circles, RgbdFrame
 from mushpipe.core.types import Header
-from mushpipe.stages.cap_clod import CLOD_CHANCE, LIKELY, clods
+from mushpipe.stages.cap_clod import CLOD_CHANCE, LIKELY
+from mushpipe.stages.cap_clod import clods as clods_of
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_kin import FEWEST
+from mushpipe.stages.cap_kin import FEWEST, kin_of
 
 HEIGHT, WIDTH, RADIUS = 240, 320, 9.0
 WHITE, BROWN = np.array([190.0, 180, 165]), np.array([120.0, 80, 55])
@@ -39,6 +40,10 @@ def tones_of(count: int, usual: np.ndarray, odd: dict[int, np.ndarray]) -> np.nd
     for row, tone in odd.items():
         tones[row] = tone
     return tones
+
+
+def clods(color: np.ndarray, circles: Circles) -> np.ndarray:
+    return clods_of(color, circles, kin_of(color, circles))
 
 
 @pytest.mark.parametrize("light", [0.5, 1.0, 1.3])

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mushpipe import Circles, RgbdFrame
 from mushpipe.core.types import Header
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_kin import DARK, FEWEST, MOST, SURE, USUAL, unlike
+from mushpipe.stages.cap_kin import DARK, FEWEST, MOST, SURE, USUAL, kin_of, unlike
 
 HEIGHT, WIDTH, RADIUS = 240, 320, 9.0
 CAP, CLOD, SOIL = np.array([190.0, 180, 165]), np.array([60.0, 45, 35]), np.array([40.0, 30, 25])
@@ -40,7 +40,7 @@ def test_a_clod_among_caps_is_unlike_them_and_caps_are_not(exposure: float) -> N
     circles = circles_of(30)
     tones = np.tile(CAP, (30, 1))
     tones[[4, 17]] = CLOD
-    found = unlike(bed(circles, tones, exposure), circles)
+    found = unlike(kin_of(bed(circles, tones, exposure), circles))
     assert (found[[4, 17]] > 3).all()
     assert (np.delete(found, [4, 17]) < 0.2).all()
 
@@ -49,7 +49,7 @@ def test_a_white_cup_among_brown_caps_is_as_unlike_as_the_other_way_round() -> N
     circles = circles_of(20)
     tones = np.tile(CLOD + 30, (20, 1))
     tones[7] = 230
-    found = unlike(bed(circles, tones), circles)
+    found = unlike(kin_of(bed(circles, tones), circles))
     assert found[7] > 3
     assert (np.delete(found, 7) < 0.2).all()
 
@@ -59,7 +59,7 @@ def test_light_that_falls_off_across_the_bed_makes_no_cap_unlike() -> None:
     light = np.exp(np.linspace(0, -1.2, WIDTH))[None].repeat(HEIGHT, axis=0)
     tones = np.tile(CAP, (60, 1))
     tones[22] = CLOD
-    found = unlike(bed(circles, tones, light), circles)
+    found = unlike(kin_of(bed(circles, tones, light), circles))
     assert found[22] > 2
     assert (np.delete(found, 22) < 0.5).all()
 
@@ -69,7 +69,7 @@ def test_caps_of_a_second_kind_have_kin_as_well_and_a_single_one_of_a_third_has_
     tones = np.tile(CAP, (40, 1))
     tones[::5] = [130, 85, 55]  # eight brown caps among white ones
     tones[13] = CLOD
-    found = unlike(bed(circles, tones), circles)
+    found = unlike(kin_of(bed(circles, tones), circles))
     assert found[13] > 1.5
     assert (np.delete(found, 13) < 0.2).all()
 
@@ -79,7 +79,7 @@ def test_a_few_clods_that_the_detector_is_sure_of_do_not_vouch_for_each_other() 
     tones = np.tile(CAP, (60, 1))
     clods = [7, 21, 33, 52]
     tones[clods] = CLOD
-    found = unlike(bed(circles, tones), circles)
+    found = unlike(kin_of(bed(circles, tones), circles))
     assert (found[clods] > 3).all()
     assert (np.delete(found, clods) < 0.2).all()
 
@@ -90,7 +90,7 @@ def test_it_is_the_distance_to_the_nearest_tenth_of_the_sure_circles(seed: int) 
     count = int(rng.integers(FEWEST, 60))
     circles = circles_of(count, rng.uniform(0.8, 1, count))
     tones = rng.integers(20, 255, (count, 3)).astype(float)
-    found = unlike(bed(circles, tones), circles)
+    found = unlike(kin_of(bed(circles, tones), circles))
     sure = np.flatnonzero(circles.score >= SURE)
     if len(sure) < FEWEST:
         assert np.isnan(found).all()
@@ -110,7 +110,7 @@ def test_it_is_the_difference_in_units_of_the_usual_one(count: int, shade: float
     circles = circles_of(count + 1, np.append(np.full(count, 0.95), 0.4))
     tones = np.tile(CAP, (count + 1, 1))
     tones[-1] = np.rint(CAP * shade)
-    found = unlike(bed(circles, tones), circles)
+    found = unlike(kin_of(bed(circles, tones), circles))
     r, g, b = np.log(tones[-1] + DARK) - np.log(CAP + DARK)
     expected = np.sqrt(np.mean((np.array([(r + g + b) / 3, r - g, b - g]) / USUAL) ** 2))
     assert found[-1] == pytest.approx(min(expected, MOST), abs=1e-6)
@@ -119,12 +119,12 @@ def test_it_is_the_difference_in_units_of_the_usual_one(count: int, shade: float
 
 def test_too_few_sure_caps_tell_nothing_and_circles_beyond_the_image_do_no_harm() -> None:
     few = circles_of(30, np.append(np.full(FEWEST - 1, 0.95), np.full(31 - FEWEST, 0.89)))
-    assert np.isnan(unlike(bed(few, CAP), few)).all()
+    assert np.isnan(unlike(kin_of(bed(few, CAP), few))).all()
     none = Circles(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
-    assert len(unlike(bed(none, np.zeros((0, 3))), none)) == 0
+    assert len(unlike(kin_of(bed(none, np.zeros((0, 3))), none))) == 0
     circles = circles_of(8)
     outside = Circles(np.vstack([circles.center, [[-50, 500]]]), np.full(9, RADIUS), np.ones(9))
-    assert np.isfinite(unlike(bed(circles, CAP), outside)).all()
+    assert np.isfinite(unlike(kin_of(bed(circles, CAP), outside))).all()
 
 
 def test_without_depth_a_clod_goes_caps_stay_and_no_score_rises() -> None:

@@ -5,7 +5,7 @@ import pytest
 
 from mushpipe import Circles, Mask, UsageError
 from mushpipe.stages.phase_hough import PhaseHough
-from mushpipe.stages.phase_learned import add_discs, agreement, candidates_of, with_bare
+from mushpipe.stages.phase_learned import add_discs, agreement, candidates_of, with_bare, within
 from tests.stages.caps import cap, draw, frame_from
 from tests.stages.scenes import discs, frame_of
 
@@ -26,7 +26,7 @@ def test_agreement_is_score_times_shared_area() -> None:
 
 def test_candidates_are_the_circles_of_the_range_and_a_tenth_beyond() -> None:
     rows = [(50.0, 40.0, radius, 0.5) for radius in (7.1, 7.3, 20.0, 49.0, 50.0)]
-    assert candidates_of(circles(*rows), 8, 45) == pytest.approx(np.array(rows[1:4]))
+    assert candidates_of(within(circles(*rows), 8, 45)) == pytest.approx(np.array(rows[1:4]))
 
 
 def test_beside_a_network_less_of_an_outline_makes_no_candidate_unless_it_is_asked_for() -> None:
