@@ -82,7 +82,7 @@ train-seeds: train
 
 $(NET)/seed-%.onnx:
 	$(BIN)/python -m training.net.train --seed $* --out $(NET)/seed-$*.pt
-	$(BIN)/python -m training.net.train --seed 2$* --start $(NET)/seed-$*.pt --steps 5000 \
+	$(BIN)/python -m training.net.train --seed 2$* --start $(NET)/seed-$*.pt --steps 8000 \
 	  --rate 1.2e-3 --stained --out $(NET)/stained-$*.pt
 	$(BIN)/python -m training.net.export --weights $(NET)/seed-$*.pt $(NET)/stained-$*.pt --out $@
 

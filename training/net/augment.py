@@ -41,11 +41,9 @@ def crop(
     )  # fmt: skip
     cap = cv2.warpAffine(picture.cap.astype(np.float32), matrix, (size, size))
     image, cap = np.asarray(color, np.float32) / 255, np.asarray(cap, np.float32)
+    image = photographed(image, cap, rng, stained)
     center = picture.circles[:, :2] @ matrix[:, :2].T + matrix[:, 2]
     circles = np.column_stack([center, picture.circles[:, 2] * scale])
-    if rng.random() < 0.25:
-        image = shadowed(image, circles, rng)
-    image = photographed(textured(image, cap, rng), cap, rng, stained)
     stump = picture.kind == Ignore.CUT_STUMP
     target, weight = aims(circles[~stump], (picture.visible < HIDDEN)[~stump], size // STRIDE)
     target[MASK] = cv2.resize(cap, None, fx=1 / STRIDE, fy=1 / STRIDE, interpolation=cv2.INTER_AREA)
@@ -101,61 +99,6 @@ def aims(
         target[OFFSET.start][nearer], target[OFFSET.start + 1][nearer] = dx[nearer], dy[nearer]
         weight[heat > 0.3] = 1
     return target, weight
-
-
-def textured(image: Singles, cap: Singles, rng: np.random.Generator) -> Singles:
-    """Return an image (H, W, 3) with grain on caps or a smooth bed, at times with both.
-
-    Simulated caps are smooth and soil and stumps are not: it was by that that a network told them,
-    and it took grainy caps for stumps and smooth lumps for caps.
-    """
-    if rng.random() < 0.35:
-        image = smooth_bed(image, cap, float(rng.uniform(0.7, 3)))
-    if rng.random() < 0.4:
-        image = grained(image, cap, rng)
-    return image
-
-
-def grained(image: Singles, where: Singles, rng: np.random.Generator) -> Singles:
-    """Return an image (H, W, 3) with grain of 1 to 4 px in `where` (H, W) 0..1."""
-    height, width = where.shape
-    size = int(max(height, width) / np.exp(rng.uniform(0, np.log(4))))
-    start = rng.integers(len(_NOISE) - size * size)
-    fine = _NOISE[start : start + size * size].reshape(size, size)
-    grain = cv2.resize(fine, (width, height), interpolation=cv2.INTER_CUBIC)
-    tint = np.exp(rng.normal(0, 0.3, 3)) * np.exp(rng.uniform(np.log(0.02), np.log(0.2)))
-    change = (where * grain)[..., None] * tint.astype(np.float32)
-    return np.asarray(image * np.maximum(0, 1 + change), np.float32)
-
-
-def smooth_bed(image: Singles, cap: Singles, sigma: float) -> Singles:
-    """Return an image (H, W, 3) blurred by sigma (px) where there is no cap (H, W) 0..1."""
-    bed = 1 - cap
-    part = cv2.GaussianBlur(np.dstack([image * bed[..., None], bed]), (0, 0), sigma)
-    smooth = part[..., :3] / np.maximum(part[..., 3:], 1e-3)
-    return np.asarray(image + bed[..., None] * (smooth - image), np.float32)
-
-
-def shadowed(image: Singles, circles: Floats, rng: np.random.Generator) -> Singles:
-    """Return an image (H, W, 3) in which caps (N, 3) px shade themselves and what is behind them.
-
-    As of a lamp from the side: a band as wide as the cap, but for the part that faces the lamp.
-    """
-    turn, reach, lit = rng.uniform(0, 2 * np.pi), rng.uniform(0.3, 2), rng.uniform(0, 0.8)
-    way = np.array([np.cos(turn), np.sin(turn)])
-    shade = np.zeros(image.shape[:2], np.uint8)
-    for x, y, radius in circles[rng.random(len(circles)) < 0.8]:
-        own, place, r = np.zeros_like(shade), np.array((x, y)), max(1, round(radius))
-        end = place + reach * radius * way
-        cv2.line(own, _pixel(place), _pixel(end), 255, 2 * r, cv2.LINE_AA)
-        cv2.circle(own, _pixel(place - lit * radius * way), r, 0, -1, cv2.LINE_AA)
-        shade |= own
-    dark = cv2.GaussianBlur(shade.astype(np.float32) / 255, (0, 0), rng.uniform(0.5, 3))
-    return np.asarray(image * (1 - np.float32(rng.uniform(0.2, 0.8)) * dark)[..., None], np.float32)
-
-
-def _pixel(place: Floats) -> tuple[int, int]:
-    return round(float(place[0])), round(float(place[1]))
 
 
 def photographed(

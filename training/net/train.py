@@ -90,7 +90,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cache", type=Path, default=Path("out/net"), help="rendered frames")
     parser.add_argument("--frames", type=int, default=TRAINING)
-    parser.add_argument("--steps", type=int, default=9000)
+    parser.add_argument("--steps", type=int, default=12000)
     parser.add_argument("--rate", type=float, default=RATE, help="largest learning rate")
     parser.add_argument("--stained", action="store_true", help="blotched and overexposed as well")
     parser.add_argument("--start", type=Path, help="weights to go on from")
