@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from mushpipe.core.truth import TRUTH_TOPIC
+from mushpipe.core.truth import INSTANCES_TOPIC, TRUTH_TOPIC
 from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.cap_net import CapNet
 from mushpipe.stages.phase_hough import PhaseHough
 from tests.stages.frames import simulated
 from training.matching import Score, counted
+from training.net.scenes import cap_mask
 
 RADII = (8.0, 45.0)
 
@@ -51,3 +54,21 @@ def test_what_is_hardly_a_cap_changes_nothing_about_those_that_are_likely(learne
             assert np.array_equal(getattr(same, column), getattr(likely, column))
         below += len(found) - len(same)
     assert below > 0
+
+
+def test_grainy_caps_that_the_net_doubts_are_found_without_depth() -> None:
+    """The simulator's caps are smooth, and the net takes grainy ones for stumps."""
+    alone, both = Score(), Score()
+    for seed in (91, 92, 93):
+        frame = simulated(seed, width=640, height=480, shape_family="b", count=40, stumps=4)
+        truth = frame.attached[TRUTH_TOPIC]
+        cap = cap_mask(truth, frame.attached[INSTANCES_TOPIC])
+        grain = 1 + 0.2 * np.random.default_rng(seed).standard_normal(cap.shape) * cap
+        color = np.clip(frame.color * grain[..., None], 0, 255).astype(np.uint8)
+        frame = replace(frame, color=color, depth=None)
+        mask, learned = CapNet(radius_px=RADII, min_score=0.05).process(frame)
+        circles = PhaseHough(radius_px=RADII, use_learned=True).process(frame, mask, learned)
+        alone.add(CapNet(radius_px=RADII).process(frame)[1], truth, counted(truth, *RADII))
+        both.add(circles, truth, counted(truth, *RADII))
+    assert both.recall > max(0.7, alone.recall + 0.2)
+    assert both.precision > 0.9
