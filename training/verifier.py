@@ -54,12 +54,13 @@ RIDGE = 1e-3  # per candidate
 DECAY = 1e-4  # of a network's weights
 TEACHERS = 5
 SCHEDULE = ((20, 2e-3), (10, 2.5e-4))  # passes over the candidates, and the rate of learning
-# How to detect, and which model learns from it.
+# How to detect, and which model learns from it. A regression beside `cap-net` learns from more than
+# it will decide about: without the candidates with little evidence it takes more soil for caps.
 PASSES: tuple[tuple[dict[str, Any], str], ...] = (
     ({"use_depth": False}, "image"),
     ({}, "depth"),
     ({"input": "mask"}, "mask"),
-    ({"use_depth": False, "use_learned": True}, "image_learned"),
+    ({"use_depth": False, "use_learned": True, "evidence": 0.07}, "image_learned"),
     ({"use_learned": True}, "depth_learned"),
 )
 FEATURES = {
