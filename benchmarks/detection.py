@@ -16,12 +16,12 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 
 import cv2
 import numba
 import numpy as np
-import skimage
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -142,7 +142,8 @@ def main() -> None:
         "cap-net": (network(), arguments.repeats),
     }  # fmt: skip
     print(f"python {platform.python_version()}, numpy {np.__version__}, numba {numba.__version__},")
-    print(f"opencv {cv2.__version__}, scikit-image {skimage.__version__}; {platform.processor()}")
+    opencv, scikit = version("opencv-python-headless"), version("scikit-image")
+    print(f"opencv {opencv}, scikit-image {scikit}; {platform.processor()}")
     print(f"scene dense, family b, seeds {seeds}, 640x480")
     reference = 0.0
     for name, (run, repeats) in chains.items():

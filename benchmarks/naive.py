@@ -34,7 +34,7 @@ def segmented(gray: np.ndarray) -> np.ndarray:
     mask = chan_vese(gray, mu=0.1, tol=1e-12, max_num_iter=500, init_level_set=start)
     if mask.any() and not mask.all() and gray[mask].mean() < gray[~mask].mean():
         mask = ~mask
-    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, KERNEL)
+    return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, KERNEL))
 
 
 def circles(mask: np.ndarray) -> np.ndarray:
@@ -54,7 +54,7 @@ def nearest(cloud: np.ndarray, circle: np.ndarray, x: float, y: float) -> np.nda
     if not usable.any():
         return np.full(3, np.nan)
     at = np.argmin(np.where(usable, (u - x) ** 2 + (v - y) ** 2, np.inf))
-    return cloud.reshape(-1, 3)[at]
+    return np.asarray(cloud.reshape(-1, 3)[at])
 
 
 def diameter(cloud: np.ndarray, circle: np.ndarray) -> float:

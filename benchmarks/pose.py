@@ -10,14 +10,16 @@ import os
 import platform
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import cast
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 from pose_scenes import frames, true_circles
 
-from mushpipe import Circles, DepthSource
+from mushpipe import Camera, Circles, DepthSource
 from mushpipe.core.libraries import import_open3d
 from mushpipe.stages.cap_attempt import ODD
 from mushpipe.stages.cap_fit import CapFit
@@ -70,7 +72,8 @@ def main() -> None:
         f"Python {platform.python_version()}, numba {numba.__version__}, "
         f"open3d {import_open3d().__version__}, OMP_NUM_THREADS={os.environ.get('OMP_NUM_THREADS')}"
     )
-    fits, measured = fit.fit(frame.gray, frame.depth_m, frame.camera, circles), DepthSource.MEASURED
+    camera, measured = cast(Camera, frame.camera), DepthSource.MEASURED
+    fits = fit.fit(frame.gray, frame.depth_m, camera, circles)
     holes = np.count_nonzero(fit.process(frame, circles)[0].source != measured)
     print(f"{holes} have a hole at the centre, {np.count_nonzero(fits.misfit > ODD)} fit poorly")
     fuse = FuseDepth()
@@ -87,7 +90,7 @@ def main() -> None:
             "depth-correct": (lambda: DepthCorrect(offset_mm=2.85).process(frame), often),
             # each for itself: the least time of a long call would hold more of what disturbs it
             **{
-                f"{k}": (lambda k=k: register.align(frame, few, where, k, 0), ROUNDS)
+                f"{k}": (partial(register.align, frame, few, where, k, 0), ROUNDS)
                 for k in range(len(few))
             },
         }

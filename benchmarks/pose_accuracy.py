@@ -78,7 +78,7 @@ def trivial(kind: str) -> Method:
             axis = np.where(np.isnan(axis), np.nan, upright("bed", depth, pixel_rays(frame.camera)))
         n = len(circles)
         turn = np.full((n, 4), np.nan)
-        known = np.isfinite(axis).all(axis=1)
+        known = np.asarray(np.isfinite(axis).all(axis=1))
         turn[known] = [0, 0, 0, 1]
         nan = np.full(n, np.nan)
         return locations, Poses(turn, axis, locations.position, nan, nan, known)

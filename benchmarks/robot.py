@@ -23,7 +23,7 @@ import threading
 import time
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -52,8 +52,8 @@ def random_picks(count: int, rng: np.random.Generator) -> Picks:
         sigma_position=rng.uniform(0, 0.002, (count, 3)),
         sigma_diameter=rng.uniform(0, 0.002, count),
         sigma_tilt=rng.uniform(0, 0.1, count),
-        source=np.ones(count),
-        flags=np.zeros(count),
+        source=np.ones(count, np.uint8),
+        flags=np.zeros(count, np.uint32),
         frame_id="camera_color_optical_frame",
     )
 
@@ -71,8 +71,8 @@ def listen(port: int, count: int) -> None:
     last_word = time.monotonic()
     while selector.get_map():
         for key, _ in selector.select(1.0):
-            sock, i = key.fileobj, key.data
-            data = sock.recv(1 << 20)  # type: ignore[union-attr]
+            sock, i = cast(socket.socket, key.fileobj), key.data
+            data = sock.recv(1 << 20)
             now = time.monotonic()
             if not data:
                 selector.unregister(sock)

@@ -17,14 +17,14 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 from graph_cut import graph_cut
 from numpy.typing import NDArray
 
-from mushpipe import RgbdFrame, Stage
+from mushpipe import RgbdFrame
 from mushpipe.sources.mcap import McapSource
 from mushpipe.sources.synthetic import SyntheticSource
 from mushpipe.stages.chan_vese import ChanVese
@@ -40,7 +40,8 @@ Region = NDArray[np.bool_]
 T = TypeVar("T")
 MU = 0.1
 SEED = 7000
-SCENES = [
+Segmenter = Otsu | KMeans | ChanVese | Height | Flatten
+SCENES: list[dict[str, Any]] = [
     {"shape_family": "a"},
     {"shape_family": "b", "count": 150, "cluster": 1.0},
     {"shape_family": "a", "light": "gradient", "light_strength": 0.5},
@@ -147,13 +148,13 @@ def timed(call: Callable[[], T], repeats: int) -> tuple[T, float]:
 
 def stages(frames: list[RgbdFrame]) -> None:
     """Print the time of whole stages, each on its own copy of the frame's images."""
-    gray, auto = ChanVese(), ChanVese(channel="auto")
-    table: dict[str, Stage] = {
+    gray = ChanVese()
+    table: dict[str, Segmenter] = {
         "otsu": Otsu(),
         "otsu, check: false": Otsu(check=False),
         "kmeans": KMeans(),
         "chan-vese": gray,
-        "chan-vese, channel: auto": auto,
+        "chan-vese, channel: auto": ChanVese(channel="auto"),
         "chan-vese, channel: rgb": ChanVese(channel="rgb"),
         "chan-vese, solver: morphological": ChanVese(solver="morphological"),
         "height": Height(),
@@ -169,7 +170,7 @@ def stages(frames: list[RgbdFrame]) -> None:
     print(f"| opening | {1e3 * float(np.mean(best)):.2f} |")
 
 
-def stage_ms(stage: Stage, frames: list[RgbdFrame]) -> float:
+def stage_ms(stage: Segmenter, frames: list[RgbdFrame]) -> float:
     """Return the mean over frames of the least time; gray and metric depth are made anew."""
     times = []
     for frame in frames:

@@ -33,8 +33,9 @@ from training.verifier import NET, RADII, VARIED, segmentations
 
 LEAST = 0.1  # score
 NEUTRAL = 0.3  # IoU with a mushroom that need not be found, from which on a circle teaches nothing
-ALONE, BESIDE = {}, {"use_learned": True}
-SETTINGS = [{**net, "use_depth": deep} for deep in (True, False) for net in (ALONE, BESIDE)]
+SETTINGS = [
+    {"use_learned": net, "use_depth": deep} for deep in (True, False) for net in (False, True)
+]
 STAGES = [PhaseHough(radius_px=RADII, min_score=LEAST, **each) for each in SETTINGS]
 HEAD = """\
 # The verifier of the stage `cap-fit`: logistic regressions over what the fit found and over how

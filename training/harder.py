@@ -21,7 +21,7 @@ def stained(case: Case, rng: np.random.Generator) -> Case:
     """Return a case with blotched caps, in half of the frames on a blotched bed."""
     frame = case.frame
     cap = cap_mask(case.truth, frame.attached[INSTANCES_TOPIC]).astype(np.float32)
-    image = blotched(frame.color.astype(np.float32) / 255, cap, rng)
+    image = blotched(np.asarray(frame.color, np.float32) / np.float32(255), cap, rng)
     if rng.random() < 0.5:
         image = blotched(image, 1 - cap, rng)
     color = np.clip(np.rint(image * 255), 0, 255).astype(np.uint8)

@@ -18,7 +18,8 @@ IOU = 0.5
 
 def counted(truth: Truth, smallest: float, largest: float) -> NDArray[np.bool_]:
     """Return which caps must be found, for a detector of a range of radii (px)."""
-    return (truth.ignore == 0) & (truth.radius >= smallest) & (truth.radius <= largest)
+    sized = (truth.radius >= smallest) & (truth.radius <= largest)
+    return np.asarray((truth.ignore == 0) & sized)
 
 
 def matched(iou: Floats, counts: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,6 +27,7 @@ from mushpipe.stages.chan_vese import ChanVese
 from mushpipe.stages.flatten import Flatten
 from mushpipe.stages.opening import Opening
 from mushpipe.stages.otsu import Otsu
+from mushpipe.stages.phase_edges import Rows
 from mushpipe.stages.phase_features import (
     DEPTH_FEATURES,
     IMAGE_FEATURES,
@@ -45,6 +46,7 @@ from training.scenes import Case, more_cases, training_cases
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Parts = dict[str, Floats]  # of a model, as in `verifier_net.Models`
+Trained = dict[str, tuple[Sequence[str], Parts]]  # the features of each model, and its parts
 RADII = (8.0, 45.0)
 VARIED, FEW = 140, 20  # varied frames, and how many of them regressions learn from
 BETTER = 0.15  # of IoU; less gained nothing on scenes that chose nothing
@@ -131,7 +133,7 @@ def doubtful(circles: Circles, rng: np.random.Generator) -> Circles:
     return Circles(circles.center[kept], circles.radius[kept], score[kept])
 
 
-def labels(case: Case, circles: Circles, order: NDArray[np.intp]) -> Floats:
+def labels(case: Case, circles: Circles, order: Rows) -> Floats:
     """Return 1 for right, 0 for wrong, NaN for candidates (N,) that teach nothing.
 
     The first of the accepted candidates (`order`) on a cap is right, all others on it are wrong;
@@ -239,7 +241,7 @@ def train(cache: Path, out: Path, rounds: int) -> None:
     from them cost 0.1 to 0.2 points of F on the frames for choosing.
     """
     cases = [*prepared(cache)]
-    models = {name: (known, first_guess(known)) for name, known in FEATURES.items()}
+    models: Trained = {name: (known, first_guess(known)) for name, known in FEATURES.items()}
     write_models(out, models)
     for turn in range(rounds):
         for settings, name in PASSES:

@@ -7,18 +7,20 @@ import json
 import socket
 import sys
 import time
+from typing import Any
 
 port = int(sys.argv[1]) if len(sys.argv) > 1 else 5005
 with socket.create_connection(("127.0.0.1", port), timeout=3) as sock, sock.makefile("rw") as line:
     numbers = iter(range(1, 1 << 53))
 
-    def ask(op, **fields):
+    def ask(op: str, **fields: Any) -> dict[str, Any]:
         """Send a request and return its answer."""
         number = next(numbers)
         line.write(json.dumps({"op": op, "id": number, **fields}) + "\n")
         line.flush()
-        while (answer := json.loads(line.readline())).get("id") != number:
-            pass  # a heartbeat
+        answer: dict[str, Any] = {}
+        while answer.get("id") != number:  # a heartbeat has none
+            answer = json.loads(line.readline())
         return answer
 
     # A machine in production does not accept_replay.

@@ -39,8 +39,8 @@ def crop(
         picture.color, matrix, (size, size), flags=cv2.INTER_LINEAR,
         borderValue=rng.integers(0, 256, 3).tolist(),
     )  # fmt: skip
-    cap = cv2.warpAffine(picture.cap.astype(np.float32), matrix, (size, size))
-    image, cap = np.asarray(color, np.float32) / 255, np.asarray(cap, np.float32)
+    warped = cv2.warpAffine(picture.cap.astype(np.float32), matrix, (size, size))
+    image, cap = np.asarray(color, np.float32) / np.float32(255), np.asarray(warped, np.float32)
     image = photographed(image, cap, rng, stained)
     center = picture.circles[:, :2] @ matrix[:, :2].T + matrix[:, 2]
     circles = np.column_stack([center, picture.circles[:, 2] * scale])
@@ -176,7 +176,7 @@ def blackened(image: Singles, cap: Singles, rng: np.random.Generator) -> Singles
     inside = image[cap > 0.9]
     darkest = float(np.quantile(inside.mean(axis=1), 0.05)) if len(inside) else 0.2
     black = np.float32(min(0.9, rng.uniform(0.2, 1) * darkest))
-    return np.maximum(image - black, 0) / (1 - black)
+    return np.asarray(np.maximum(image - black, 0) / (1 - black), np.float32)
 
 
 def _light(size: int, rng: np.random.Generator) -> Singles:

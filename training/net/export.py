@@ -71,7 +71,8 @@ def judged(circles: Circles, picture: Picture) -> Floats:
 def wanted(picture: Picture) -> np.ndarray:
     """Return which outlines (N,) must be found."""
     radius = picture.circles[:, 2]
-    return (picture.kind == Ignore.COUNTS) & (radius >= RADII[0]) & (radius <= RADII[1])
+    sized = (radius >= RADII[0]) & (radius <= RADII[1])
+    return np.asarray((picture.kind == Ignore.COUNTS) & sized)
 
 
 def found(stage: Stage, cases: list[Picture]) -> tuple[Floats, Floats, int]:

@@ -20,7 +20,7 @@ from onnxruntime.quantization.shape_inference import quant_pre_process
 from training.net.scenes import VALIDATION_SEED, pictures
 
 
-class Frames(CalibrationDataReader):  # type: ignore[misc]
+class Frames(CalibrationDataReader):
     """Validation frames, as the stage hands them to the network."""
 
     def __init__(self, cache: Path, count: int) -> None:

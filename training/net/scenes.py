@@ -107,7 +107,7 @@ def picture(seed: int, cache: Path) -> Picture:
         _render(seed, path)
     with np.load(path) as file:
         color = cv2.imdecode(file["color"], cv2.IMREAD_COLOR_RGB)
-        cap = cv2.imdecode(file["cap"], cv2.IMREAD_GRAYSCALE) > 0
+        cap = np.asarray(cv2.imdecode(file["cap"], cv2.IMREAD_GRAYSCALE), np.uint8) > 0
         return Picture(
             np.asarray(color, np.uint8), cap, file["circles"], file["kind"], file["visible"]
         )
