@@ -20,9 +20,7 @@ from mushpipe.evaluate.matching import match
 from mushpipe.evaluate.truth import FrameTruth
 from mushpipe.sources.synthetic import SyntheticSource
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_kin import kin_of, unlike
 from mushpipe.stages.cap_net import CapNet
-from mushpipe.stages.cap_verify import chances
 from mushpipe.stages.phase_hough import PhaseHough
 
 GRAPH = Path(__file__).parents[1] / "graphs" / "pick.yaml"
@@ -87,8 +85,7 @@ def found_in(frame: RgbdFrame) -> Circles:
     if not len(circles) or frame.camera is None:
         return circles
     fits = pose.fit(frame.gray, frame.depth_m, frame.camera, circles)
-    chance = chances(circles, unlike(kin_of(frame.color, circles)), fits)
-    return circles.take(chance >= (pose.min_score or 0.0))
+    return circles.take(pose.scores(frame, circles, fits) >= (pose.min_score or 0.0))
 
 
 def detected(frame: RgbdFrame) -> tuple[Circles, np.ndarray]:

@@ -76,7 +76,7 @@ class CapFit(Stage):
         frame, circles = example_frame(), example_circles()
         self.process(frame, circles)
         if self.min_score is not None:
-            self._scores(frame, circles.take(np.zeros(FEWEST, np.intp)))
+            self.scores(frame, circles.take(np.zeros(FEWEST, np.intp)))
 
     def process(self, frame: RgbdFrame, circles: Circles) -> tuple[Locations, Poses, Circles]:
         """Return one location and one pose per circle, and the circles, improved.
@@ -86,7 +86,7 @@ class CapFit(Stage):
         """
         if frame.depth is None or not len(circles):
             unknown = Locations.unknown(len(circles)), Poses.unknown(len(circles))
-            scored = Circles(circles.center, circles.radius, self._scores(frame, circles))
+            scored = Circles(circles.center, circles.radius, self.scores(frame, circles))
             return self._kept(*unknown, scored)
         if frame.camera is None:
             raise InputError(
@@ -96,7 +96,7 @@ class CapFit(Stage):
         depth = frame.depth_m
         order = by_depth(depth, discs_of(circles))
         fits = self.fit(frame.gray, depth, frame.camera, circles, order)
-        score = self._scores(frame, circles, fits)
+        score = self.scores(frame, circles, fits)
         circles = Circles(fits.circle[:, :2], fits.circle[:, 2], score)
         source = np.where(fits.valid, sources(circles, depth), DepthSource.MISSING)
         holes = np.flatnonzero(source == DepthSource.NEIGHBOURS)
@@ -104,7 +104,14 @@ class CapFit(Stage):
             self._bridge(holes, fits, depth, frame.camera, circles, order)
         return self._kept(_locations(fits, source.astype(np.uint8)), _poses(fits), circles)
 
-    def _scores(self, frame: RgbdFrame, circles: Circles, fits: Fits | None = None) -> Floats:
+    def scores(self, frame: RgbdFrame, circles: Circles, fits: Fits | None = None) -> Floats:
+        """Return how likely circles (N,) are caps; without `min_score` the scores they have.
+
+        Args:
+            frame: What they were found in.
+            circles: As detected, with the scores of `phase-hough`.
+            fits: The caps fitted in them; None without depth.
+        """
         if self.min_score is None:
             return circles.score
         kin = kin_of(frame.color, circles)
