@@ -34,7 +34,7 @@ from mushpipe.stages.phase_features import (
     LEARNED,
     NAMES,
 )
-from mushpipe.stages.phase_hough import PhaseHough, equal_area_radius
+from mushpipe.stages.phase_hough import EVIDENCE, PhaseHough, equal_area_radius
 from mushpipe.stages.phase_verifier import FILE
 from mushpipe.stages.verifier_net import LIMIT, WIDTHS, write_models
 from training import logistic
@@ -62,7 +62,7 @@ PASSES: tuple[tuple[dict[str, Any], str], ...] = (
     ({"use_depth": False}, "image"),
     ({}, "depth"),
     ({"input": "mask"}, "mask"),
-    ({"use_depth": False, "use_learned": True, "evidence": 0.07}, "image_learned"),
+    ({"use_depth": False, "use_learned": True, "evidence": EVIDENCE}, "image_learned"),
     ({"use_learned": True}, "depth_learned"),
 )
 FEATURES = {

@@ -41,7 +41,7 @@ _FLOOR = 4.0  # gray levels per px; Otsu's threshold of an image without edges i
 _TOP = 64.0  # gray levels per px; larger gradients count as this in Otsu's threshold
 _AROUND = np.ones((7, 7), np.uint8)  # edges are taken so far around the foreground
 _STANDING = 0.004  # m; what is higher than this over the bed is looked at, in the mask or not
-_EVIDENCE = 0.07  # share of an outline that votes; half-hidden caps show hardly more
+EVIDENCE = 0.07  # share of an outline that votes; half-hidden caps show hardly more
 _BESIDE = 0.2  # the same beside a network: what has less it sees as well, and fewer cost less time
 _EVERY = 2  # edge points; of so many one votes where network and depth bring candidates as well
 _REACH = 2  # cells around a peak within which it must be the highest
@@ -189,7 +189,7 @@ class PhaseHough(Stage):
         size = (-(-height // CELL), -(-width // CELL))
         every = 1 if learned is None or relief is None else _EVERY
         cells = vote(edges, rings_between(smallest, largest), size, every)
-        evidence = self.evidence or (_EVIDENCE if learned is None else _BESIDE)
+        evidence = self.evidence or (EVIDENCE if learned is None else _BESIDE)
         found = peaks(*summed(cells), evidence, smallest, largest, _REACH)
         known = None if learned is None else within(learned, smallest, largest)
         if known is not None:
