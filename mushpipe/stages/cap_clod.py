@@ -46,12 +46,27 @@ def clods(color: NDArray[np.uint8], circles: Circles, kin: Kin) -> NDArray[np.bo
     if not len(kin.sure):
         return np.zeros(len(circles), np.bool_)
     odd = distances(*kin, -(-len(kin.sure) // 2)) > ODD
-    ground = np.full(kin.tones.shape, np.nan)
+    return off_ground(color, circles, kin.tones, odd) < ALIKE
+
+
+def off_ground(
+    color: NDArray[np.uint8], circles: Circles, tones: Floats, asked: NDArray[np.bool_]
+) -> Floats:
+    """Return how far the tones of circles (N,) are from that of the ground around each.
+
+    NaN where it is not asked for, no ground is seen, or it is too dark to tell.
+
+    Args:
+        color: (H, W, 3) RGB.
+        circles: As detected, with the scores of `phase-hough`.
+        tones: (N, 3) of `cap_kin.tones_of`.
+        asked: (N,) of which circles.
+    """
+    ground = np.full(tones.shape, np.nan)
     discs, likely = discs_of(circles), circles.score >= LIKELY
-    _grounds(locked(color, np.uint8), discs, odd, likely, ground)
-    dark = ground[:, 0] < math.log(NIGHT + DARK)
-    away = np.linalg.norm(kin.tones - ground / UNIT, axis=1)
-    return np.asarray(odd & ~dark & (away < ALIKE))
+    _grounds(locked(color, np.uint8), discs, asked, likely, ground)
+    ground[ground[:, 0] < math.log(NIGHT + DARK)] = np.nan
+    return np.asarray(np.linalg.norm(tones - ground / UNIT, axis=1))
 
 
 @borrower

@@ -56,10 +56,15 @@ def kin_of(color: NDArray[np.uint8], circles: Circles) -> Kin:
     sure = np.flatnonzero(circles.score >= SURE)
     if len(sure) < FEWEST:
         return Kin(np.full((len(circles), 3), np.nan), sure[:0])
+    return Kin(tones_of(color, circles), sure)
+
+
+def tones_of(color: NDArray[np.uint8], circles: Circles) -> Floats:
+    """Return the tone (N, 3) of circles in an image (H, W, 3) RGB, in units as those of `Kin`."""
     tones = np.empty((len(circles), 3))
     # read-only as a frame's: to the compiler another type, and another kernel
     _tones(locked(color, np.uint8), discs_of(circles), tones)
-    return Kin(np.asarray(tones / UNIT), sure)
+    return np.asarray(tones / UNIT)
 
 
 def unlike(kin: Kin) -> Floats:

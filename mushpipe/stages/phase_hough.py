@@ -26,7 +26,14 @@ from mushpipe.stages.phase_edges import (
 )
 from mushpipe.stages.phase_features import LEARNED, NAMES, static_features
 from mushpipe.stages.phase_fuse import fused
-from mushpipe.stages.phase_learned import add_discs, agreement, candidates_of, with_bare, within
+from mushpipe.stages.phase_learned import (
+    add_discs,
+    agreement,
+    candidates_of,
+    with_bare,
+    within,
+    without_clods,
+)
 from mushpipe.stages.phase_polish import polish
 from mushpipe.stages.phase_refit import Table, refit
 from mushpipe.stages.phase_strips import Strips, in_strips
@@ -160,8 +167,11 @@ class PhaseHough(Stage):
         owner[np.isin(owner, np.flatnonzero(after))] = -1
         polish(found.edges, found.height, found.pixel, shapes, owner, *found.range)
         circles = Circles(shapes[:, :2], equal_area_radius(shapes), score)
-        if found.learned is None or len(found.height):
+        if found.learned is None:
             return circles
+        if len(found.height):
+            unseen = found.table[order, NAMES.index(LEARNED)] == 0
+            return without_clods(frame.color, circles, unseen)
         sure = found.learned.take(found.learned.score >= max(_SURE, self.min_score))
         radius = equal_area_radius(found.shapes)
         return with_bare(circles, sure, found.shapes, radius, order[score >= _LIKELY])
@@ -261,6 +271,7 @@ class PhaseHough(Stage):
             frame = example_frame(native=native)
             mask = Mask(frame.depth_m < 0.49)
             self.process(frame, mask, example_circles())
+        without_clods(frame.color, example_circles(), np.ones(1, np.bool_))
         self.process(replace(frame, depth=None), mask, example_circles())
 
 

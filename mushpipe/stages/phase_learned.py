@@ -9,12 +9,15 @@ from numpy.typing import NDArray
 
 from mushpipe import Circles
 from mushpipe.core.jit import borrower, jit
+from mushpipe.stages.cap_clod import off_ground
+from mushpipe.stages.cap_kin import tones_of
 from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE, iou, lens
 from mushpipe.stages.phase_edges import Plane, Rows
 from mushpipe.stages.phase_refit import Table
 
 _AROUND = 4.0  # px; a circle of a network is not more exact than that
 _SAME = 0.5  # IoU from which on an outline is that of a circle
+_GROUND = 1.8  # distance of tones up to which an unseen circle looks like the ground around it
 _OWN = 0.5  # share of a circle that none that was accepted may cover
 
 
@@ -42,6 +45,23 @@ def agreement(shapes: Table, radius: Table, learned: Circles) -> Table:
     The largest score of a circle, times its IoU with the outline's circle.
     """
     return _agreement(shapes, radius, learned.center, learned.radius, learned.score)
+
+
+def without_clods(color: NDArray[np.uint8], circles: Circles, unseen: NDArray[np.bool_]) -> Circles:
+    """Return the circles but for those that the network sees nothing of and that look like ground.
+
+    A round clod has the form of a cap in depth as well. Caps that the network sees nothing of are
+    few, and do not look like what is around them.
+
+    Args:
+        color: (H, W, 3) RGB.
+        circles: Those accepted.
+        unseen: (N,) on which of them no circle of the network lies.
+    """
+    if not unseen.any():
+        return circles
+    away = off_ground(color, circles, tones_of(color, circles), unseen)
+    return circles.take(~(away < _GROUND))
 
 
 def with_bare(

@@ -5,7 +5,14 @@ import pytest
 
 from mushpipe import Circles, Mask, UsageError
 from mushpipe.stages.phase_hough import PhaseHough
-from mushpipe.stages.phase_learned import add_discs, agreement, candidates_of, with_bare, within
+from mushpipe.stages.phase_learned import (
+    add_discs,
+    agreement,
+    candidates_of,
+    with_bare,
+    within,
+    without_clods,
+)
 from tests.stages.caps import cap, draw, frame_from
 from tests.stages.scenes import discs, frame_of
 
@@ -85,6 +92,23 @@ def test_with_depth_the_network_has_nothing_to_say_where_none_of_its_circles_lie
     assert asked.score == pytest.approx(alone.score, abs=1e-4)
 
 
+def test_with_depth_what_looks_like_the_ground_is_a_cap_only_where_the_network_sees_something() -> (
+    None
+):
+    caps = [cap(5, 40, (-0.05, 0, 0.4), 0.02, 0.55), cap(10, 200, (0.05, 0, 0.4), 0.022, 0.6)]
+    depth, _ = draw(caps, 0.44)
+    gray = np.full_like(depth, 0.3)
+    gray[:, : depth.shape[1] // 2][depth[:, : depth.shape[1] // 2] < 0.435] = 0.7
+    frame, mask = frame_from(depth, gray), Mask(depth < 0.435)
+    white, clod = PhaseHough(use_learned=True, min_score=0.2), PhaseHough(min_score=0.2)
+    both = clod.process(frame, mask)
+    assert len(both) == 2
+    place = both.center[np.argmax(both.center[:, 0])]
+    left = white.process(frame, mask, circles())
+    assert left.center == pytest.approx(both.center[both.center[:, 0] < place[0]], abs=0.5)
+    assert len(white.process(frame, mask, circles((*place, 20, 0.1)))) == 2
+
+
 def test_without_depth_what_the_network_does_not_see_is_no_cap() -> None:
     image = discs([(40, 60, 20), (110, 60, 15)], 0.8, 0.1)
     frame, mask = frame_of(image), Mask(image > 0.5)
@@ -132,3 +156,21 @@ def test_circles_without_an_outline_come_from_nowhere_but_free_ground() -> None:
     found = with_bare(circles(), circles(*rows), shapes, shapes[:, 2], np.array([0]))
     # the last lies in an outline that was not accepted
     assert found.center.tolist() == [[50, 76], [150, 62]]
+
+
+def test_clods_are_left_out_where_the_network_sees_nothing_and_the_ground_is_lit() -> None:
+    soil, white, brown = (60, 48, 40), (190, 180, 165), (120, 80, 55)
+    v, u = np.mgrid[:120, :240]
+    color = np.full((120, 240, 3), soil, np.uint8)
+    found = circles((40, 60, 12, 0.9), (90, 60, 12, 0.9), (150, 60, 12, 0.9), (205, 60, 12, 0.9))
+    for (x, y), tone in zip(found.center, (white, soil, brown, soil), strict=True):
+        color[np.hypot(u - x, v - y) < 12] = tone
+
+    def left(seen: list[int], color: np.ndarray) -> list[float]:
+        unseen = ~np.isin(np.arange(4), seen)
+        return without_clods(color, found, unseen).center[:, 0].tolist()
+
+    assert left([], color) == [40, 150]
+    assert left([3], color) == [40, 150, 205]
+    assert left([0, 1, 2, 3], color) == [40, 90, 150, 205]
+    assert left([], color // 5) == [40, 90, 150, 205]
