@@ -50,7 +50,11 @@ def clods(color: NDArray[np.uint8], circles: Circles, kin: Kin) -> NDArray[np.bo
 
 
 def off_ground(
-    color: NDArray[np.uint8], circles: Circles, tones: Floats, asked: NDArray[np.bool_]
+    color: NDArray[np.uint8],
+    circles: Circles,
+    tones: Floats,
+    asked: NDArray[np.bool_],
+    uneven: float = 0.0,
 ) -> Floats:
     """Return how far the tones of circles (N,) are from that of the ground around each.
 
@@ -61,12 +65,14 @@ def off_ground(
         circles: As detected, with the scores of `phase-hough`.
         tones: (N, 3) of `cap_kin.tones_of`.
         asked: (N,) of which circles.
+        uneven: Standard deviation of the brightness of the ground over its mean, from which on it
+            counts as ground.
     """
-    ground = np.full(tones.shape, np.nan)
+    ground = np.full((len(tones), 4), np.nan)
     discs, likely = discs_of(circles), circles.score >= LIKELY
     _grounds(locked(color, np.uint8), discs, asked, likely, ground)
-    ground[ground[:, 0] < math.log(NIGHT + DARK)] = np.nan
-    return np.asarray(np.linalg.norm(tones - ground / UNIT, axis=1))
+    ground[(ground[:, 0] < math.log(NIGHT + DARK)) | (ground[:, 3] < uneven)] = np.nan
+    return np.asarray(np.linalg.norm(tones - ground[:, :3] / UNIT, axis=1))
 
 
 @borrower
@@ -74,12 +80,12 @@ def _grounds(
     color: NDArray[np.uint8], discs: Floats, asked: NDArray[np.bool_], likely: NDArray[np.bool_],
     ground: Floats,
 ) -> None:  # fmt: skip
-    """Write the tone of the ground around the discs (N, 3) that are asked for, where it is seen."""
+    """Write tone and unevenness (N, 4) of the ground around the discs (N, 3) that are asked for."""
     height, width = color.shape[:2]
     for k in range(len(discs)):
         if not asked[k]:
             continue
-        red = green = blue = seen = 0
+        red = green = blue = squares = seen = 0
         for s in range(len(RING)):
             x, y = discs[k, 0] + discs[k, 2] * RING[s, 0], discs[k, 1] + discs[k, 2] * RING[s, 1]
             u, v = math.floor(x + 0.5), math.floor(y + 0.5)
@@ -87,9 +93,13 @@ def _grounds(
                 red += color[v, u, 0]
                 green += color[v, u, 1]
                 blue += color[v, u, 2]
+                gray = int(color[v, u, 0]) + int(color[v, u, 1]) + int(color[v, u, 2])
+                squares += gray * gray
                 seen += 1
         if seen >= LEAST:
             write_tone(red / seen, green / seen, blue / seen, ground[k])
+            mean = (red + green + blue) / seen
+            ground[k, 3] = math.sqrt(max(0.0, squares / seen - mean * mean)) / (mean + 3 * DARK)
 
 
 @borrower

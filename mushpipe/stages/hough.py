@@ -96,8 +96,9 @@ class HoughSkimage(_Peer):
         if not len(radii):
             return np.zeros((0, 3))
         space = hough_circle(canny(np.asarray(gray, np.float64), self.sigma), radii)
-        _, x, y, radius = hough_circle_peaks(space, radii, threshold=self.votes)
-        return np.column_stack([x, y, radius]).astype(np.float64)
+        votes, x, y, radius = hough_circle_peaks(space, radii, threshold=self.votes)
+        order = np.lexsort([x, y, radius, -votes])  # ties come in another order on other processors
+        return np.column_stack([x, y, radius]).astype(np.float64)[order]
 
 
 def first_of_each_place(circles: Floats, apart: float) -> NDArray[np.intp]:

@@ -17,7 +17,8 @@ from mushpipe.stages.phase_refit import Table
 
 _AROUND = 4.0  # px; a circle of a network is not more exact than that
 _SAME = 0.5  # IoU from which on an outline is that of a circle
-_GROUND = 1.8  # distance of tones up to which an unseen circle looks like the ground around it
+_GROUND = 1.5  # distance of tones up to which an unseen circle looks like the ground around it
+_UNEVEN = 0.12  # spread of its brightness over the mean, below which ground holds no clods
 _OWN = 0.5  # share of a circle that none that was accepted may cover
 
 
@@ -51,16 +52,20 @@ def without_clods(color: NDArray[np.uint8], circles: Circles, unseen: NDArray[np
     """Return the circles but for those that the network sees nothing of and that look like ground.
 
     A round clod has the form of a cap in depth as well. Caps that the network sees nothing of are
-    few, and do not look like what is around them.
+    few, and do not look like what is around them. Even ground, such as a table, holds no clods, and
+    where the border cuts a circle too little of it is seen.
 
     Args:
         color: (H, W, 3) RGB.
         circles: Those accepted.
         unseen: (N,) on which of them no circle of the network lies.
     """
-    if not unseen.any():
+    corner = np.array([color.shape[1] - 1, color.shape[0] - 1])
+    room = np.minimum(circles.center, corner - circles.center)
+    asked = unseen & (room.min(axis=1) >= circles.radius)
+    if not asked.any():
         return circles
-    away = off_ground(color, circles, tones_of(color, circles), unseen)
+    away = off_ground(color, circles, tones_of(color, circles), asked, _UNEVEN)
     return circles.take(~(away < _GROUND))
 
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import subprocess
 import sys
 from pathlib import Path
@@ -26,6 +27,23 @@ from mushpipe.stages.chan_vese_fast import solve_fast
 image = np.zeros((40, 40), np.float32)
 image[10:30, 10:30] = 1
 print(int(solve_fast(image, image > 0.5, 0.1).sum()))
+"""
+
+TARGET = """
+from llvmlite.binding import get_host_cpu_features
+from mushpipe.core import jit
+from numba.core.registry import cpu_target
+import numpy as np
+@jit.jit
+def total(values):
+    most = 0.0
+    for value in values:
+        most += value * value
+    return most
+total(np.ones(1000))
+_, name, features = cpu_target.target_context.codegen().magic_tuple()
+print(name, features == "", "zmm" in total.inspect_asm(total.signatures[0]),
+      all(get_host_cpu_features().get(each) for each in jit._NEEDED))
 """
 
 FIRST_FRAME = """
@@ -152,3 +170,19 @@ def test_a_kernel_that_counts_no_references_cannot_make_an_array() -> None:
 
     with pytest.raises(NumbaError, match="Only accept returning of array passed"):
         make(3)
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="another kind of processor")
+def test_kernels_are_the_same_on_all_x86_processors_of_the_last_ten_years() -> None:
+    def compiled(**names: str) -> list[str]:
+        environment = {k: v for k, v in os.environ.items() if not k.startswith("NUMBA_CPU")}
+        command = [sys.executable, "-c", TARGET]
+        printed = subprocess.run(
+            command, env=environment | names, capture_output=True, text=True, check=True
+        )
+        return printed.stdout.split()
+
+    name, bare, wide, able = compiled()
+    assert wide == "False"
+    assert (name, bare) == ("x86-64-v3", "True") or able == "False"
+    assert compiled(NUMBA_CPU_NAME="x86-64")[0] == "x86-64"

@@ -92,21 +92,18 @@ def test_with_depth_the_network_has_nothing_to_say_where_none_of_its_circles_lie
     assert asked.score == pytest.approx(alone.score, abs=1e-4)
 
 
-def test_with_depth_what_looks_like_the_ground_is_a_cap_only_where_the_network_sees_something() -> (
-    None
-):
+def test_with_depth_what_looks_like_uneven_ground_and_the_network_does_not_see_is_no_cap() -> None:
     caps = [cap(5, 40, (-0.05, 0, 0.4), 0.02, 0.55), cap(10, 200, (0.05, 0, 0.4), 0.022, 0.6)]
     depth, _ = draw(caps, 0.44)
-    gray = np.full_like(depth, 0.3)
-    gray[:, : depth.shape[1] // 2][depth[:, : depth.shape[1] // 2] < 0.435] = 0.7
-    frame, mask = frame_from(depth, gray), Mask(depth < 0.435)
-    white, clod = PhaseHough(use_learned=True, min_score=0.2), PhaseHough(min_score=0.2)
-    both = clod.process(frame, mask)
-    assert len(both) == 2
-    place = both.center[np.argmax(both.center[:, 0])]
-    left = white.process(frame, mask, circles())
-    assert left.center == pytest.approx(both.center[both.center[:, 0] < place[0]], abs=0.5)
-    assert len(white.process(frame, mask, circles((*place, 20, 0.1)))) == 2
+    left = np.arange(depth.shape[1]) < depth.shape[1] // 2
+    gray = np.where((depth < 0.435) & left, 0.7, 0.3)
+    soil = gray + (depth >= 0.435) * np.random.default_rng(0).normal(0, 0.06, depth.shape)
+    mask, stage = Mask(depth < 0.435), PhaseHough(use_learned=True, min_score=0.2)
+    frame = frame_from(depth, soil)
+    white, clod = sorted(PhaseHough(min_score=0.2).process(frame, mask).center.tolist())
+    assert stage.process(frame, mask, circles()).center == pytest.approx(np.array([white]), abs=0.5)
+    assert len(stage.process(frame, mask, circles((*clod, 20, 0.1)))) == 2
+    assert len(stage.process(frame_from(depth, gray), mask, circles())) == 2
 
 
 def test_without_depth_what_the_network_does_not_see_is_no_cap() -> None:
@@ -159,9 +156,10 @@ def test_circles_without_an_outline_come_from_nowhere_but_free_ground() -> None:
 
 
 def test_clods_are_left_out_where_the_network_sees_nothing_and_the_ground_is_lit() -> None:
-    soil, white, brown = (60, 48, 40), (190, 180, 165), (120, 80, 55)
+    soil, white, brown = np.array([(60, 48, 40), (190, 180, 165), (120, 80, 55)])
     v, u = np.mgrid[:120, :240]
-    color = np.full((120, 240, 3), soil, np.uint8)
+    grain = np.random.default_rng(0).normal(1, 0.25, (120, 240, 1))
+    color = np.clip(soil * grain, 0, 255).astype(np.uint8)
     found = circles((40, 60, 12, 0.9), (90, 60, 12, 0.9), (150, 60, 12, 0.9), (205, 60, 12, 0.9))
     for (x, y), tone in zip(found.center, (white, soil, brown, soil), strict=True):
         color[np.hypot(u - x, v - y) < 12] = tone
@@ -174,3 +172,8 @@ def test_clods_are_left_out_where_the_network_sees_nothing_and_the_ground_is_lit
     assert left([3], color) == [40, 150, 205]
     assert left([0, 1, 2, 3], color) == [40, 90, 150, 205]
     assert left([], color // 5) == [40, 90, 150, 205]
+    cut = Circles(found.center - (80, 0), found.radius, found.score).take([1, 3])
+    nothing_seen = np.ones(2, np.bool_)
+    assert without_clods(color[:, 80:], cut, nothing_seen).center[:, 0].tolist() == [10]
+    even = np.where(np.abs(color.astype(int) - soil).max(axis=2, keepdims=True) < 60, soil, color)
+    assert left([], even.astype(np.uint8)) == [40, 90, 150, 205]
