@@ -17,6 +17,9 @@ MAX_NODES = 20_000
 MAX_DEPTH = 50
 # What PyYAML raises on text that is no YAML: an escape like "\UFFFFFFFF" is an OverflowError.
 _UNREADABLE = (yaml.YAMLError, RecursionError, ValueError, OverflowError)
+# Octal with a plain zero and sexagesimal numbers of YAML 1.1: nobody who writes 010 or 1:20 means 8
+# or 80.
+_OLD_NUMBER = re.compile(r"[-+]?0[0-9_]|.*:")
 _COLLECTIONS = {"map", "seq"}
 _SCALARS = {"null", "bool", "int", "float", "str", "timestamp"}
 
@@ -73,7 +76,11 @@ def read_document(path: Path) -> Document:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise GraphError([Problem(str(path), 0, 0, "there is no such file")]) from None
-    except (OSError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
+        before = error.object[: error.start].split(b"\n")
+        message = f"not UTF-8: the byte 0x{error.object[error.start]:02x} ({error.reason})"
+        raise GraphError([Problem(str(path), len(before), len(before[-1]) + 1, message)]) from error
+    except OSError as error:
         raise GraphError([Problem(str(path), 0, 0, f"cannot be read: {error}")]) from error
     return parse_document(text, str(path), path.parent)
 
@@ -91,7 +98,12 @@ def parse_document(text: str, file: str, base: Path) -> Document:
         raise GraphError([Problem(file, line, column, message, "", excerpt)]) from error
     except _UNREADABLE as error:
         reason = "it is nested too deeply" if isinstance(error, RecursionError) else error
-        raise GraphError([Problem(file, 0, 0, f"not valid YAML: {reason}")]) from error
+        line = column = 0
+        if isinstance(error, yaml.reader.ReaderError):
+            before = text[: error.position].split("\n")
+            line, column = len(before), len(before[-1]) + 1
+            reason = f"the character #x{ord(text[error.position]):04x} cannot stand in YAML"
+        raise GraphError([Problem(file, line, column, f"not valid YAML: {reason}")]) from error
     builder = _Builder(document)
     data = builder.build(root, ()) if root else None
     if not builder.problems and not isinstance(data, dict):
@@ -179,7 +191,11 @@ class _Builder:
         if tag == "timestamp":
             return node.value
         try:
-            return self.loader.construct_object(node)
+            value = self.loader.construct_object(node)
+            if tag in ("int", "float") and _OLD_NUMBER.match(node.value):
+                text = f"'{node.value}' is {value} in YAML: write that number, or quotes around it"
+                self._object(at, text)
+            return value
         except (ValueError, LookupError, yaml.YAMLError):
             self._object(at, f"not a valid {tag}: '{node.value}'")
             return None

@@ -215,7 +215,9 @@ def _node(
     settings = {k: v for k, v in entry.items() if k not in WORDS}
     use, inputs, delivery = entry.get("use"), entry.get("inputs", {}), entry.get("delivery")
     if not isinstance(use, str):
-        problems.append(document.problem(at, f"needs 'use': the name of a {kind}", key=True))
+        together = any(key.startswith("use:") for key in entry)
+        hint = "a space after the colon, as in 'use: name'" if together else ""
+        problems.append(document.problem(at, f"needs 'use': the name of a {kind}", hint, key=True))
         return None
     if not isinstance(inputs, dict) or not all(isinstance(v, str) for v in inputs.values()):
         problems.append(document.problem((*at, "inputs"), "expected {parameter: stage name}"))

@@ -13,6 +13,11 @@ from numpy.typing import NDArray
 from mushpipe.core.errors import UsageError
 from mushpipe.core.libraries import import_onnxruntime
 
+_FLOATS = {
+    "tensor(float)": np.float32,
+    "tensor(float16)": np.float16,
+    "tensor(double)": np.float64,
+}
 Sizes = tuple[tuple[str, int], ...]  # of free dimensions, by their names
 
 
@@ -28,7 +33,8 @@ class OnnxFile:
         metadata: What its maker wrote into it.
 
     Raises:
-        UsageError: The file is missing or is no ONNX model that this ONNX Runtime can run.
+        UsageError: The file is missing, is no ONNX model that this ONNX Runtime can run, or takes
+            no floats.
         DependencyError: ONNX Runtime is not installed.
     """
 
@@ -41,6 +47,10 @@ class OnnxFile:
         session = self._session(())
         self.inputs = _shapes(session.get_inputs())
         self.outputs = _shapes(session.get_outputs())
+        kind = session.get_inputs()[0].type if self.inputs else ""
+        if kind not in _FLOATS:
+            raise UsageError(f"model {path}: its input is {kind or 'missing'}, expected floats")
+        self._float = _FLOATS[kind]
         self.metadata: Mapping[str, str] = session.get_modelmeta().custom_metadata_map
 
     def __call__(self, image: NDArray[np.float32], output: str) -> NDArray[Any]:
@@ -50,8 +60,9 @@ class OnnxFile:
             UsageError: The network refuses the image.
         """
         name = next(iter(self.inputs))
+        given = {name: image.astype(self._float, copy=False)}
         try:
-            found = self._session(self._sizes(image.shape)).run([output], {name: image})[0]
+            found = self._session(self._sizes(image.shape)).run([output], given)[0]
         except Exception as error:
             raise UsageError(
                 f"model {self.path} expects {name} {list(self.inputs[name])} and got "

@@ -72,6 +72,10 @@ class Plugin(BaseModel):
         named = ((n, getattr(self, n)) for n, f in settings if is_written(f) is written)
         return {n: Path(v) for n, v in named if isinstance(v, kinds) and Path(v) != STDIO}
 
+    def required_inputs(self) -> frozenset[str]:
+        """Return inputs that a graph may leave out, but not with these settings."""
+        return frozenset()
+
     def close(self) -> None:
         """Release what `open` took; also called after a failure, and after a failed `open`."""
 

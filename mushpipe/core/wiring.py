@@ -7,13 +7,15 @@ from mushpipe.core.errors import MushpipeError, Problem, suggest
 from mushpipe.core.plan import Link, Node
 from mushpipe.core.plugins import Registry
 from mushpipe.core.stage import Port, ports_of
+from mushpipe.core.tables import Circles, Locations, Poses
 from mushpipe.core.types import Trace
 
 
 def wire(document: Document, registry: Registry, nodes: list[Node]) -> list[Problem]:
     """Fill the links of all nodes, given source first, then stages, then sinks, in file order.
 
-    An output that nobody takes becomes a warning of the document.
+    An output that nobody takes becomes a warning of the document, and so do locations or poses
+    that are of other circles than those they come together with.
     """
     problems: list[Problem] = []
     for position, node in enumerate(nodes):
@@ -34,6 +36,7 @@ def wire(document: Document, registry: Registry, nodes: list[Node]) -> list[Prob
             problems += [problem] if problem else []
     if not problems:
         _warn_unused(document, nodes)
+        _warn_mixed(document, nodes)
     return problems
 
 
@@ -56,7 +59,7 @@ def _connect(
     if wanted is not None:
         message = _why_not(node, port, wanted, above, nodes)
         return document.problem((*at, "inputs", port.name), message)
-    if not port.required:
+    if not port.required and port.name not in node.plugin.required_inputs():
         return None
     message = f"nothing above '{node.name}' produces the {port.type.__name__} of its '{port.name}'"
     return document.problem(at, message, _who_produces(registry, port), key=True)
@@ -115,3 +118,24 @@ def _warn_unused(document: Document, nodes: list[Node]) -> None:
     for node in nodes:
         if node.kind == "stage" and node.name not in used:
             document.warnings.append(f"nobody takes what '{node.name}' produces")
+
+
+def _warn_mixed(document: Document, nodes: list[Node]) -> None:
+    named = {node.name: node for node in nodes}
+    for node in nodes:
+        circles = _source_of(node, Circles)
+        for kind in (Locations, Poses):
+            maker = _source_of(node, kind)
+            seen = maker and _source_of(named[maker], Circles)
+            if circles and seen and circles not in (maker, seen):
+                document.warnings.append(
+                    f"'{node.name}' takes the circles of '{circles}', and from '{maker}' the "
+                    f"{kind.__name__.lower()} of those of '{seen}': their rows may differ"
+                )
+
+
+def _source_of(node: Node, kind: type) -> str | None:
+    """Return the producer of an input of a type."""
+    ports = [port.name for port in node.ports.inputs if port.type is kind]
+    link = node.links.get(ports[0]) if ports else None
+    return link.producer if link else None

@@ -70,7 +70,8 @@ class JsonSession:
             return self._answer(parse(line), now)
         except Refusal as refusal:
             if not self.ready and not refusal.fatal:
-                refusal = Refusal("hello_expected", f"before hello: {refusal}", fatal=True)
+                text = f"before hello: {refusal}"
+                refusal = Refusal("hello_expected", text, fatal=True, **refusal.extra)
             return self.refuse(refusal, now)
 
     def due(self, now: float) -> Outgoing | None:
@@ -114,7 +115,8 @@ class JsonSession:
         if isinstance(message, Hello):
             self._welcome(message)
         elif not self.ready:
-            raise Refusal("hello_expected", "the first line must be a hello", fatal=True)
+            asked = {"id": message.id} if isinstance(message, GetTargets | Ack | Ping) else {}
+            raise Refusal("hello_expected", "the first line must be a hello", fatal=True, **asked)
         elif isinstance(message, GetTargets):
             return self._get(message, now)
         elif isinstance(message, Ack):

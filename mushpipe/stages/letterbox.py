@@ -38,7 +38,14 @@ class Letterbox:
         return canvas
 
     def cut(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the image's part (H, W) of values (h, w) that cover the canvas."""
+        """Return the image's part (H, W) of values (h, w) that cover the canvas.
+
+        Raises:
+            ValueError: They have another shape than the canvas, by more than two columns or rows.
+        """
+        (rows, columns), (across, down) = values.shape, self.canvas
+        if abs(columns * down - rows * across) > 2 * max(across, down):
+            raise ValueError(f"{columns}x{rows} values cover no image of {across}x{down} px")
         (left, top), (width, height) = self.corner, self.inner
         whole = resized(values, self.canvas)[top : top + height, left : left + width]
         return resized(whole, self.image)

@@ -2,48 +2,50 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal, Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, PrivateAttr
+from pydantic import Field, PrivateAttr, model_validator
 
 from mushpipe import Circles, GraphPath, Mask, RgbdFrame, Stage
 from mushpipe.core.errors import UsageError
 from mushpipe.core.onnx_file import OnnxFile
 from mushpipe.stages.cap_decode import first_of_each
 from mushpipe.stages.letterbox import Floats, Letterbox, letterbox
+from mushpipe.stages.onnx_layouts import PER_PIXEL, SHAPES, boxes_of, in_pixels, probability
 
 Triple = tuple[float, float, float]
 Size = Annotated[int, Field(ge=1)]
 Spread = Annotated[float, Field(gt=0)]
 _MOST = 1000  # boxes that are looked at, the surest
-_ROUNDED = 1e-3  # how far rounding takes a score out of 0..1
-_SHAPES = {
-    "logits": "(1, C, h, w) or (1, h, w)",
-    "yolov5": "(1, N, 5 + C)",
-    "yolov8": "(1, 4 + C, N)",
-    "yolov10": "(1, N, 6)",
-}
 
 
 class Onnx(Stage):
     """Runs an ONNX model of your own on the colour image; gives a mask and circles.
 
     `logits`: the mask is where the class is likelier than `min_score` (softmax; sigmoid of a
-    single channel), and each connected piece becomes the circle of its area. Boxes as YOLO exports
-    them: a circle has the area of the ellipse in its box, and the mask is the union of the
-    circles. The model takes one image (1, 3, H, W).
+    single channel), and each connected piece becomes the circle of its area. `probabilities` are
+    those of a model that ends in these, `labels` (classes of pixels) those of one that ends in an
+    argmax. Boxes as YOLO exports them: a circle has the area of the ellipse in its box, and the
+    mask is the union of the circles. The model takes one image (1, 3, H, W) of floats.
     """
 
     model: GraphPath = Field(description="the ONNX file")
-    output: Literal["logits", "yolov5", "yolov8", "yolov10"] = Field(
-        description="what it returns: logits (1, C, h, w), or boxes: (1, N, 5 + C) with "
-        "objectness, (1, 4 + C, N), or (1, N, 6) with corners, score and class"
+    output: Literal["logits", "probabilities", "labels", "yolov5", "yolov8", "yolov10"] = Field(
+        description="what it returns: logits or probabilities (1, C, h, w), classes of pixels, or "
+        "boxes: (1, N, 5 + C) with objectness, (1, 4 + C, N), or (1, N, 6) with corners, score and "
+        "class"
     )
     tensor: str | None = Field(None, description="name of the output; null: the first")
-    class_id: int = Field(0, ge=0, description="the class, or channel, that is mushroom")
+    class_id: int = Field(
+        0, ge=0, description="the class, or channel, that is mushroom; to be given for `labels`"
+    )
+    normalised: bool = Field(
+        False, description="boxes are shares (0..1) of the input's width and height, not px"
+    )
     size: tuple[Size, Size] | None = Field(
         None,
         description="width, height of its input, px, where the model leaves them free; null: the "
@@ -57,6 +59,12 @@ class Onnx(Stage):
 
     _net: OnnxFile | None = PrivateAttr(None)
 
+    @model_validator(mode="after")
+    def _labelled(self) -> Self:
+        if self.output == "labels" and "class_id" not in self.model_fields_set:
+            raise ValueError("class_id is missing: which label is mushroom? 0 is mostly the ground")
+        return self
+
     def open(self) -> None:
         """Read the model; raises as `_load` does."""
         self._load()
@@ -65,16 +73,22 @@ class Onnx(Stage):
         """Return the model.
 
         Raises:
-            UsageError: It is missing, damaged, has no such output, or takes no single image.
+            UsageError: It is missing, damaged, has no such output, or takes no single image, or
+                none of such a size.
             DependencyError: ONNX Runtime is not installed.
         """
         if self._net is not None:
             return self._net
         net = OnnxFile(self.model)
         shapes = list(net.inputs.values())
-        if len(shapes) != 1 or len(shapes[0]) != 4 or shapes[0][1] != 3:
+        if len(shapes) != 1 or len(shapes[0]) != 4 or not _fits(shapes[0][:2], (1, 3)):
             raise UsageError(
                 f"model {net.path} takes {net.inputs}, expected one image (1, 3, H, W)"
+            )
+        if self.size and not _fits(shapes[0][:1:-1], self.size):
+            raise UsageError(
+                f"model {net.path} takes images of {shapes[0][3]}x{shapes[0][2]} px, which `size` "
+                "cannot change: leave it out"
             )
         if self.tensor not in (None, *net.outputs):
             known = ", ".join(net.outputs)
@@ -96,8 +110,8 @@ class Onnx(Stage):
             return self._mapped(found, box)
         except (IndexError, ValueError) as error:
             raise UsageError(
-                f"model {net.path}: its output has shape {found.shape}; output '{self.output}' "
-                f"with class_id {self.class_id} expects {_SHAPES[self.output]}"
+                f"model {net.path}: {error}; its output has shape {found.shape}; output "
+                f"'{self.output}' with class_id {self.class_id} expects {SHAPES[self.output]}"
             ) from error
 
     def _letterbox(self, shape: tuple[Any, ...], width: int, height: int) -> Letterbox:
@@ -116,70 +130,27 @@ class Onnx(Stage):
 
     def _mapped(self, found: NDArray[Any], box: Letterbox) -> tuple[Mask, Circles]:
         if not np.isfinite(found).all():
-            raise UsageError(f"model {self.model}: its output has values that are no numbers")
-        if self.output == "logits":
-            return pieces(box.cut(probability(found, self.class_id)), self.min_score)
+            raise ValueError("there are values that are no numbers")
+        if self.output in PER_PIXEL:
+            likely = probability(found, self.output, self.class_id)
+            return pieces(box.cut(likely), self.min_score)
         boxes, score = boxes_of(found.astype(np.float64), self.output, self.class_id)
-        if len(score) and not -_ROUNDED <= score.min() <= score.max() <= 1 + _ROUNDED:
-            raise UsageError(
-                f"model {self.model}: scores are {score.min():.3g} to {score.max():.3g}, expected "
-                f"0 to 1: is its output laid out as output '{self.output}' has it, "
-                f"{_SHAPES[self.output]}?"
-            )
         order = np.flatnonzero(score >= self.min_score)
         order = order[np.argsort(-score[order], kind="stable")][:_MOST]
-        boxes, score = box.back(boxes[order]), np.clip(score[order], 0, 1)
+        boxes = box.back(in_pixels(boxes[order], self.normalised, box.canvas))
         inside = (boxes[:, :2] >= -0.5) & (boxes[:, :2] <= np.array(box.image) - 0.5)
         sound = (boxes[:, 2:] > 0).all(axis=1) & inside.all(axis=1)
-        circles = np.column_stack([boxes[:, :2], np.sqrt(np.abs(boxes[:, 2:]).prod(axis=1)) / 2])
-        circles, score = circles[sound], score[sound]
+        circles = np.column_stack([boxes[:, :2], np.sqrt(boxes[:, 2:].prod(axis=1)) / 2])[sound]
+        score = np.clip(score[order], 0, 1)[sound]
         keep = first_of_each(circles, self.overlap)
         return Mask(discs(circles[keep], box.image)), Circles(
             circles[keep, :2], circles[keep, 2], score[keep]
         )
 
 
-def probability(logits: NDArray[Any], channel: int) -> NDArray[np.float32]:
-    """Return the probability (h, w) of a channel of logits (1, C, h, w) or (1, h, w).
-
-    Raises:
-        ValueError, IndexError: They have another shape, or no such channel.
-    """
-    planes = logits[0] if logits.ndim == 4 else logits
-    if planes.ndim != 3 or logits.shape[0] != 1:
-        raise ValueError("neither (1, C, h, w) nor (1, h, w)")
-    if not 0 <= channel < len(planes):
-        raise IndexError(channel)
-    others = np.delete(planes, channel, axis=0).astype(np.float64)
-    rival = np.logaddexp.reduce(others, axis=0) if len(others) else 0.0
-    return np.asarray(1 / (1 + np.exp(np.clip(rival - planes[channel], -80, 80))), np.float32)
-
-
-def boxes_of(found: Floats, kind: str, class_id: int) -> tuple[Floats, Floats]:
-    """Return boxes (N, 4), centre x, y, width, height in the input's px, and scores (N,).
-
-    Args:
-        found: What the model returned, in one of the three layouts that YOLO exports.
-        kind: ``yolov5``: rows of box, objectness, classes; ``yolov8``: columns of box, classes;
-            ``yolov10``: rows of corners, score, class.
-        class_id: The class that is wanted.
-
-    Raises:
-        ValueError, IndexError: Another shape, or no such class.
-    """
-    if found.ndim != 3 or found.shape[0] != 1:
-        raise ValueError("not (1, ., .)")
-    rows = found[0].T if kind == "yolov8" else found[0]
-    if kind == "yolov10":
-        if rows.shape[1] != 6:
-            raise ValueError("not six columns")
-        rows = rows[rows[:, 5] == class_id]
-        return np.column_stack(
-            [(rows[:, :2] + rows[:, 2:4]) / 2, rows[:, 2:4] - rows[:, :2]]
-        ), rows[:, 4]
-    if kind == "yolov5":
-        return rows[:, :4], rows[:, 4] * rows[:, 5 + class_id]
-    return rows[:, :4], rows[:, 4 + class_id]
+def _fits(shape: Sequence[Any], wanted: Sequence[int]) -> bool:
+    """Return whether free dimensions, which are no int, can be as wanted, and the others are."""
+    return all(not isinstance(n, int) or n == size for n, size in zip(shape, wanted, strict=True))
 
 
 def pieces(likely: NDArray[np.float32], least: float) -> tuple[Mask, Circles]:
@@ -198,7 +169,11 @@ def pieces(likely: NDArray[np.float32], least: float) -> tuple[Mask, Circles]:
 
 def discs(circles: Floats, size: tuple[int, int]) -> NDArray[np.bool_]:
     """Return the union (H, W) of circles (N, 3) in an image of (width, height)."""
-    union = np.zeros(size[::-1], np.uint8)
-    for x, y, radius in np.rint(circles * 16).astype(int).tolist():  # sixteenths of a pixel
-        cv2.circle(union, (x, y), radius, 1, -1, shift=4)
-    return union > 0
+    width, height = size
+    union = np.zeros((height, width), np.bool_)
+    for x, y, radius in circles:
+        left, right = np.clip((x - radius, x + radius + 1), 0, width).astype(int)
+        top, bottom = np.clip((y - radius, y + radius + 1), 0, height).astype(int)
+        v, u = np.ogrid[top:bottom, left:right]
+        union[top:bottom, left:right] |= (u - x) ** 2 + (v - y) ** 2 <= radius**2
+    return union

@@ -137,6 +137,10 @@ class PhaseHough(Stage):
             raise ValueError("diameter_mm is in mm, and below 1 mm: was it given in m?")
         return self
 
+    def required_inputs(self) -> frozenset[str]:
+        """Return the circles of the network with `use_learned`."""
+        return frozenset({"learned"} if self.use_learned else ())
+
     def open(self) -> None:
         """Read the verifier and compile the kernels."""
         self._load()

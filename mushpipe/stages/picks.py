@@ -20,6 +20,10 @@ from mushpipe.stages.tracks import Tracks
 logger = logging.getLogger("mushpipe")
 SMALLEST_MM = 1.0
 HEIGHT = 0.3  # of a usual cap, in diameters
+_ONE_CHAIN = (
+    "circles, locations and poses must come from one chain; what sorts or filters circles belongs "
+    "before the localizer"
+)
 ASTRAY = 3.0  # radii; the apex of a leaning cap is seen up to two from the middle of its circle
 Rank = Literal["unoccluded", "highest", "largest", "score"]
 FlagName = Literal[
@@ -107,7 +111,8 @@ class MakePicks(Stage):
         n = len(circles)
         poses = Poses.unknown(n) if poses is None else poses
         if not n == len(locations) == len(poses):
-            raise ValueError(f"{n} circles, {len(locations)} locations, {len(poses)} poses")
+            counts = f"{n} circles, {len(locations)} locations, {len(poses)} poses"
+            raise ValueError(f"{counts}: {_ONE_CHAIN}")
         _require_same(circles, locations.position, "location", frame)
         _require_same(circles, poses.apex, "pose", frame)
         self._total += n
@@ -208,8 +213,7 @@ def _require_same(
         (u, v), (x, y) = circles.center[row], seen[row]
         raise ValueError(
             f"row {row}: the circle is at ({u:.0f}, {v:.0f}), its {what} at ({x:.0f}, {y:.0f}): "
-            "circles, locations and poses must come from one chain; what sorts or filters circles "
-            "belongs before the localizer"
+            f"{_ONE_CHAIN}"
         )
 
 

@@ -88,8 +88,19 @@ BROKEN = {
     ),
     "control character": (
         "a: \x00",
-        "g.yaml: not valid YAML: unacceptable character #x0000: special characters are not "
-        'allowed\n  in "<unicode string>", position 3',
+        "g.yaml:1:4: not valid YAML: the character #x0000 cannot stand in YAML",
+    ),
+    "octal": (
+        "a: 1\nb: [010]\n",
+        """g.yaml:2:5: '010' is 8 in YAML: write that number, or quotes around it
+    b: [010]
+        ^""",
+    ),
+    "sexagesimal": (
+        "a: 1:20\n",
+        """g.yaml:1:4: '1:20' is 80 in YAML: write that number, or quotes around it
+    a: 1:20
+       ^""",
     ),
     "a list": ("- 1\n", "g.yaml:1:1: expected a mapping such as 'mushpipe: 1'"),
     "a word": ("mushpipe\n", "g.yaml:1:1: expected a mapping such as 'mushpipe: 1'"),
@@ -181,8 +192,8 @@ def test_a_missing_file(tmp_path):
 
 def test_a_file_that_is_no_text(tmp_path):
     path = tmp_path / "bad.yaml"
-    path.write_bytes(b"a: \xff\xfe")
-    with pytest.raises(GraphError, match="cannot be read: 'utf-8' codec can't decode"):
+    path.write_bytes(b"b: 1\na: \xff\xfe")
+    with pytest.raises(GraphError, match=r"bad\.yaml:2:4: not UTF-8: the byte 0xff"):
         read_document(path)
     with pytest.raises(GraphError, match=r"cannot be read: .*Is a directory"):
         read_document(tmp_path)

@@ -127,6 +127,13 @@ FAULTS = {
       seg: {level: 3}
       ^""",
     ),
+    "no space": (
+        stage("{use:threshold}"),
+        """graph.yaml:4:3: needs 'use': the name of a stage
+      seg: {use:threshold}
+      ^
+    a space after the colon, as in 'use: name'""",
+    ),
     "an entry that is no mapping": (
         stage("threshold"),
         """graph.yaml:4:8: stages.seg: Input should be an object, got "threshold"

@@ -6,7 +6,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mushpipe import Circles, Columns, Mask, Picks, RgbdFrame, Sink, Stage, Trace
+from mushpipe import (
+    Circles,
+    Columns,
+    Locations,
+    Mask,
+    Picks,
+    Poses,
+    RgbdFrame,
+    Sink,
+    Stage,
+    Trace,
+)
 from mushpipe.core.errors import PluginError
 from mushpipe.core.plan import Link
 from mushpipe.core.stage import Port, Ports, ports_of
@@ -171,6 +182,43 @@ def test_an_optional_input_may_have_no_producer(lab: Lab):
     found = links(lab, lab.chain(declared(optional), declared(optional)))
     assert found["a"] == {"frame": Link("source", 0)}
     assert found["b"] == {"frame": Link("source", 0), "mask": Link("a", 0)}
+
+
+def test_a_setting_can_make_an_optional_input_a_required_one(lab: Lab):
+    class Picky(Stage):
+        needs_mask: bool = False
+
+        def required_inputs(self) -> frozenset[str]:
+            return frozenset({"mask"} if self.needs_mask else ())
+
+        def process(self, frame: RgbdFrame, mask: Mask | None = None) -> Circles: ...
+
+    text = lab.chain(Picky)
+    assert links(lab, text)["a"] == {"frame": Link("source", 0)}
+    text = text.replace("a: {", "a: {needs_mask: true, ")
+    assert "nothing above 'a' produces the Mask of its 'mask'" in lab.faults(text)
+
+
+def test_what_was_found_in_other_circles_is_a_warning(lab: Lab):
+    class Locate(Stage):
+        def process(self, circles: Circles) -> tuple[Locations, Poses]: ...
+
+    class Fit(Stage):
+        def process(self, circles: Circles) -> tuple[Circles, Locations]: ...
+
+    class Pick(Stage):
+        def process(self, circles: Circles, locations: Locations, poses: Poses) -> Picks: ...
+
+    def warnings(*stages: str | type[Stage]) -> tuple[str, ...]:
+        return lab.compile(lab.chain(*stages)).warnings
+
+    assert warnings("both", Locate, Pick) == warnings("both", Locate, Fit, Locate, Pick) == ()
+    mixed = (
+        "'d' takes the circles of 'c', and from 'b' the {} of those of 'a': their rows may differ"
+    )
+    expected = tuple(mixed.format(what) for what in ("locations", "poses"))
+    assert warnings("both", Locate, "both", Pick) == expected
+    assert len(warnings("both", Locate, Fit, Pick)) == 1  # only the poses are older
 
 
 FAULTS = {

@@ -245,6 +245,7 @@ def test_a_bad_line_is_answered_and_costs_nothing(line: bytes, code: str, identi
         ({"op": "hello", "version": "1.0"}, "hello_expected"),
         ({"op": "hello", "version": "1.0", "mode": "request", "name": "a b"}, "hello_expected"),
         ({"op": "get_targets", "id": 1}, "hello_expected"),
+        ({"op": "get_targets", "id": "a", "max": 0}, "hello_expected"),
         ("nonsense", "hello_expected"),
     ],
 )
@@ -255,6 +256,7 @@ def test_a_wrong_beginning_ends_the_connection(hello: object, code: str) -> None
         peer.raw(json.dumps(hello).encode() + b"\n")
         (error,) = peer.rest()
         assert (error["code"], error["fatal"]) == (code, True)
+        assert error["id"] == (hello.get("id") if isinstance(hello, dict) else None)
 
 
 def test_a_newer_minor_version_and_unknown_fields_are_welcome() -> None:

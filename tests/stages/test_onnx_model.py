@@ -4,11 +4,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from onnx import TensorProto, helper
+from pydantic import ValidationError
 
 from mushpipe import RgbdFrame
 from mushpipe.core.errors import UsageError
 from mushpipe.stages.onnx_model import Onnx
-from tests.stages.networks import answering, of_brightness
+from mushpipe.stages.onnx_model import discs as drawn
+from tests.stages.networks import answering, of_brightness, saved
 from tests.stages.scenes import HEADER, discs, frame_of
 
 CIRCLES = [(40.0, 40.0, 15.0), (100.0, 70.0, 20.0)]
@@ -128,7 +131,7 @@ def test_an_answer_that_is_no_detection_is_refused(tmp_path: Path) -> None:
     frame = frame_of(np.zeros((96, 96)), camera=None)
     box = np.array([[50, 50, 30, 30, 0.9]])
     wrong = {
-        "five": (box * [1, 1, 1, 1, 6], "scores are 5.4 to 5.4, expected 0 to 1"),
+        "five": (box * [1, 1, 1, 1, 6], "scores are 5.4 to 5.4, expected 0 to 1.*expects"),
         "none": (box * [1, 1, 1, 1, np.nan], "values that are no numbers"),
     }
     for name, (answer, text) in wrong.items():
@@ -144,3 +147,70 @@ def test_boxes_whose_middle_is_not_in_the_image_are_none(tmp_path: Path) -> None
         frame_of(np.zeros((96, 96)), camera=None)
     )
     assert circles.score == pytest.approx([0.9])
+
+
+def test_a_model_that_ends_in_sigmoid_softmax_or_argmax_is_read_as_such(tmp_path: Path) -> None:
+    color = np.zeros((32, 64, 3), np.uint8)
+    color[:, :20] = 255
+    bright, model = color[..., 0] > 0, of_brightness(tmp_path / "m.onnx", [[1 / 3] * 3], [0.0])
+    for more in ({"output": "probabilities"}, {"output": "labels", "class_id": 1}):
+        mask, circles = Onnx(model=model, **more).process(RgbdFrame(HEADER, color))
+        assert np.array_equal(mask.foreground, bright)
+        assert circles.score == pytest.approx([1.0])
+    with pytest.raises(UsageError, match=r"which logits are not.*'probabilities' or 'labels'"):
+        Onnx(model=model, output="logits").process(RgbdFrame(HEADER, color))
+    with pytest.raises(ValidationError, match="which label is mushroom"):
+        Onnx(model=model, output="labels")
+
+
+def test_boxes_in_shares_of_the_input_are_read_as_such(tmp_path: Path) -> None:
+    frame, box = frame_of(np.zeros((96, 192)), camera=None), np.array([[0.5, 0.5, 0.1, 0.2, 0.9]])
+    model = answering(tmp_path / "m.onnx", box.T[None], image=[1, 3, 96, 192])
+    _, circles = Onnx(model=model, output="yolov8", normalised=True).process(frame)
+    assert circles.center[0] == pytest.approx([95.5, 47.5])
+    assert circles.radius[0] == pytest.approx(9.6)
+    with pytest.raises(UsageError, match="set `normalised`"):
+        Onnx(model=model, output="yolov8").process(frame)
+    pixels = answering(tmp_path / "p.onnx", (box * [192, 96, 192, 96, 1]).T[None])
+    with pytest.raises(UsageError, match="boxes reach 96, but `normalised`"):
+        Onnx(model=pixels, output="yolov8", normalised=True).process(frame)
+
+
+def test_a_box_far_larger_than_the_image_is_drawn(tmp_path: Path) -> None:
+    box = np.array([[48, 48, 3e9, 3e9, 0.9]])
+    model = answering(tmp_path / "m.onnx", box.T[None], image=[1, 3, 96, 96])
+    mask, circles = Onnx(model=model, output="yolov8").process(
+        frame_of(np.zeros((96, 96)), camera=None)
+    )
+    assert mask.foreground.all()
+    assert circles.radius == pytest.approx([1.5e9])
+
+
+@pytest.mark.parametrize("kind", [TensorProto.FLOAT16, TensorProto.DOUBLE])
+def test_images_of_other_floats_are_taken(tmp_path: Path, kind: int) -> None:
+    node = helper.make_node("Cast", ["image"], ["found"], to=TensorProto.FLOAT)
+    model = saved(tmp_path / "m.onnx", [node], {}, kind=kind)
+    color = np.full((32, 64, 3), 255, np.uint8)
+    mask, _ = Onnx(model=model, output="probabilities").process(RgbdFrame(HEADER, color))
+    assert mask.foreground.all()
+
+
+def test_an_input_that_no_image_fits_is_refused_before_a_frame(tmp_path: Path) -> None:
+    node = helper.make_node("Cast", ["image"], ["found"], to=TensorProto.FLOAT)
+    whole = saved(tmp_path / "whole.onnx", [node], {}, kind=TensorProto.UINT8)
+    with pytest.raises(UsageError, match=r"its input is tensor\(uint8\), expected floats"):
+        Onnx(model=whole, output="logits").open()
+    eight = answering(tmp_path / "eight.onnx", np.zeros((8, 5, 7)), image=[8, 3, 96, 96])
+    with pytest.raises(UsageError, match="expected one image"):
+        Onnx(model=eight, output="yolov8").open()
+    fixed = answering(tmp_path / "fixed.onnx", np.zeros((1, 5, 7)), image=[1, 3, 96, 128])
+    with pytest.raises(UsageError, match="takes images of 128x96 px, which `size` cannot change"):
+        Onnx(model=fixed, output="yolov8", size=(96, 96)).open()
+
+
+@pytest.mark.parametrize("radius", [1.0, 2.3, 5.0, 8.1, 20.0])
+def test_discs_are_the_pixels_whose_middle_is_within(radius: float) -> None:
+    circles = np.array([(30.4, 20.7, radius), (-2.0, 39.0, 2 * radius), (70.0, 20.0, radius)])
+    v, u = np.mgrid[:40, :60]
+    within = [(u - x) ** 2 + (v - y) ** 2 <= r * r for x, y, r in circles]
+    assert np.array_equal(drawn(circles, (60, 40)), np.any(within, axis=0))
