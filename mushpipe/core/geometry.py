@@ -54,25 +54,46 @@ def brown_inverse(xy: Array, coefficients: tuple[float, ...], iterations: int = 
     the polynomial: a lens model is only valid inside the image it was fitted on, and a wrong ray
     must not pass for a right one.
     """
-    guess = xy.copy()
-    step = 1e-6
+    wanted = xy.reshape(-1, 2).astype(np.float64)
+    guess, step, fold = wanted.copy(), 1e-6, _fold(coefficients)
     with np.errstate(all="ignore"):
+        # A wide lens ends inside the image, and of what lies beyond nothing would converge.
+        left = np.flatnonzero(~(np.hypot(*wanted.T) > _farthest_image(coefficients, fold)))
         for _ in range(iterations):
-            error = brown(guess, coefficients) - xy
-            if np.nanmax(np.abs(error), initial=0.0) < 1e-12:
+            now = guess[left]
+            error = brown(now, coefficients) - wanted[left]
+            going = np.abs(error).max(axis=-1) >= 1e-12
+            left, now, error = left[going], now[going], error[going]
+            if not len(left):
                 break
             columns = [
-                (brown(guess + d, coefficients) - brown(guess - d, coefficients)) / (2 * step)
+                (brown(now + d, coefficients) - brown(now - d, coefficients)) / (2 * step)
                 for d in step * np.eye(2)
             ]
-            (a, c), (b, d) = (np.moveaxis(column, -1, 0) for column in columns)
-            ex, ey = error[..., 0], error[..., 1]
-            update = np.stack([d * ex - b * ey, a * ey - c * ex], axis=-1)
-            guess = guess - update / (a * d - b * c)[..., None]
-        bad = ~(np.abs(brown(guess, coefficients) - xy).max(axis=-1) < 1e-7)
-        bad |= (guess**2).sum(axis=-1) >= _fold(coefficients)
+            (a, c), (b, d) = (column.T for column in columns)
+            ex, ey = error.T
+            update = np.column_stack([d * ex - b * ey, a * ey - c * ex])
+            guess[left] = now - update / (a * d - b * c)[:, None]
+        bad = ~(np.abs(brown(guess, coefficients) - wanted).max(axis=-1) < 1e-7)
+        bad |= (guess**2).sum(axis=-1) >= fold
     guess[bad] = np.nan
-    return guess
+    return guess.reshape(xy.shape)
+
+
+def _farthest_image(coefficients: tuple[float, ...], fold: float) -> float:
+    """Return how far from the centre the image of a point short of the fold (r^2) can lie."""
+    if not np.isfinite(fold):
+        return np.inf
+    reach = np.sqrt(fold)
+    radial = np.linspace(0, reach, 100)
+    image = brown(np.column_stack([radial, 0 * radial]), _without_tangential(coefficients))
+    tangential = 3 * (abs(coefficients[2]) + abs(coefficients[3])) * fold
+    return float(1.01 * np.abs(image).max() + tangential)
+
+
+def _without_tangential(coefficients: tuple[float, ...]) -> tuple[float, ...]:
+    k1, k2, _, _, *rest = coefficients
+    return k1, k2, 0.0, 0.0, *rest
 
 
 @cache

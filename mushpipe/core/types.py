@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from mushpipe.core.geometry import Camera
 from mushpipe.core.tables import locked
 
+_FARTHEST_M = 1e5  # the largest number of millimetres that is taken for metres is less
+
 
 @dataclass(frozen=True)
 class Header:
@@ -105,13 +107,16 @@ class RgbdFrame:
 
     @cached_property
     def depth_m(self) -> NDArray[np.float32]:
-        """(H, W) float32 depth in metres, NaN = missing (everywhere without depth), read-only."""
+        """(H, W) float32 depth in metres, NaN = missing (everywhere without depth), read-only.
+
+        What no camera measures (100 km and more) is missing as well.
+        """
         if self.depth is None:
             return locked(np.full(self.color.shape[:2], np.nan), np.float32)
         import cv2
 
         metres = self.depth * np.float32(self.depth_scale)
-        known = (metres > 0) & (metres < np.inf)
+        known = (metres > 0) & (metres < _FARTHEST_M)
         # three times as fast as to assign where it is not known
         missing = np.full(metres.shape, np.nan, np.float32)
         return locked(cv2.copyTo(metres, known.view(np.uint8), missing), np.float32)

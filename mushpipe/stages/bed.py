@@ -38,18 +38,21 @@ def bed_depth(depth_m: Plane, relief: bool = True) -> Plane | None:
     coefficients = fit_plane(far_cells(depth_m, CELL))
     if coefficients is None:
         return None
-    far = far_cells(depth_m, FINE_CELL)
-    rows, columns, _ = far.shape
+    height, width = depth_m.shape
+    # One cell more on each side, so that the plane goes on to the border where the camera leans.
+    rows, columns = (-(-n // FINE_CELL) + 2 for n in (height, width))
     # The centre of cell i lies at (i + 0.5) cells - 0.5 px, as cv2.resize assumes.
-    v, u = np.mgrid[:rows, :columns] * FINE_CELL + (FINE_CELL - 1) / 2
+    v, u = (np.mgrid[:rows, :columns] - 1) * FINE_CELL + (FINE_CELL - 1) / 2
     surface = plane_depth(coefficients, u, v)
     if relief:
-        surface += bend(far[..., 2] - plane_depth(coefficients, far[..., 0], far[..., 1]))
+        far = far_cells(depth_m, FINE_CELL)
+        bent = bend(far[..., 2] - plane_depth(coefficients, far[..., 0], far[..., 1]))
+        after = (rows - 1 - bent.shape[0], columns - 1 - bent.shape[1])
+        surface += np.pad(bent, ((1, after[0]), (1, after[1])), mode="edge")
     size = (columns * FINE_CELL, rows * FINE_CELL)
     full = cv2.resize(surface.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
-    height, width = depth_m.shape
-    edge = (0, height - size[1], 0, width - size[0])
-    return np.asarray(cv2.copyMakeBorder(full, *edge, cv2.BORDER_REPLICATE), np.float32)
+    inside = full[FINE_CELL : FINE_CELL + height, FINE_CELL : FINE_CELL + width]
+    return np.ascontiguousarray(inside, np.float32)
 
 
 @jit

@@ -90,9 +90,9 @@ def _grounds(
             x, y = discs[k, 0] + discs[k, 2] * RING[s, 0], discs[k, 1] + discs[k, 2] * RING[s, 1]
             u, v = math.floor(x + 0.5), math.floor(y + 0.5)
             if 0 <= u < width and 0 <= v < height and _free(x, y, discs, likely):
-                red += color[v, u, 0]
-                green += color[v, u, 1]
-                blue += color[v, u, 2]
+                red += int(color[v, u, 0])
+                green += int(color[v, u, 1])
+                blue += int(color[v, u, 2])
                 gray = int(color[v, u, 0]) + int(color[v, u, 1]) + int(color[v, u, 2])
                 squares += gray * gray
                 seen += 1

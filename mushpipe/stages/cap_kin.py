@@ -87,9 +87,9 @@ def _tones(color: NDArray[np.uint8], discs: Floats, tones: Floats) -> None:
         for s in range(len(SAMPLES)):
             u = min(width - 1, max(0, int(x + radius * SAMPLES[s, 0])))
             v = min(height - 1, max(0, int(y + radius * SAMPLES[s, 1])))
-            red += color[v, u, 0]
-            green += color[v, u, 1]
-            blue += color[v, u, 2]
+            red += int(color[v, u, 0])
+            green += int(color[v, u, 1])
+            blue += int(color[v, u, 2])
         write_tone(red / len(SAMPLES), green / len(SAMPLES), blue / len(SAMPLES), tones[k])
 
 

@@ -26,6 +26,8 @@ from mushpipe.stages.upright_model import Model, made, read
 from mushpipe.stages.warm_up import CAMERA, example_frame
 
 Floats = NDArray[np.float64]
+_FARTHEST = 1.0  # radii; ICP slides along a smooth cap, and off it where its error is along normals
+_LEAST_FITNESS = 0.2  # share of the model; half of it faces away from the camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,13 +118,16 @@ class Registration(Stage):
         """Register the mushroom of one row; the same seed gives what a run of all rows gives.
 
         Returns:
-            None where it has too few points or no location, or leans more than `steepest_deg`.
+            None where it has too few points or no location, or where the model ran away.
 
         Raises:
             InputError: The frame has no calibration.
         """
         if frame.camera is None:
-            raise InputError("depth cannot be turned into metres without the calibration")
+            raise InputError(
+                "depth cannot be turned into metres without the calibration: record camera_info, "
+                "or set source.camera: {fx: , fy: , cx: , cy: }"
+            )
         if self._model is None:
             self.open()
         position, radius = locations.position[row], circles.radius[row]
@@ -148,7 +153,8 @@ class Registration(Stage):
             up: (3,) unit, how the model stands at the start.
 
         Returns:
-            None where there are too few points, or where it leans more than `steepest_deg`.
+            None where there are too few points, or where the model ran away: leans more than
+            `steepest_deg`, is off its start by a radius, or lies on hardly a point.
         """
         o3d, model = import_open3d(), self._model
         if not isinstance(model, Model) or len(points) < self.min_points:
@@ -163,19 +169,26 @@ class Registration(Stage):
         source = _cloud(o3d, model.points @ turn.T, model.normals @ turn.T)
         with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
             start = self._start(o3d, source, target)
-            if up @ start[:3, :3] @ up < np.cos(np.radians(self.steepest_deg)):
+            top = turn @ (model.top * model.axis)
+            if not self._stayed(start, up, top):
                 start = np.eye(4)  # a smooth cap fits upside down as well
             result = self._refine(o3d, source, target, start)
         total = np.asarray(result.transformation)
-        if up @ total[:3, :3] @ up < np.cos(np.radians(self.steepest_deg)):
+        if not self._stayed(total, up, top) or result.fitness < _LEAST_FITNESS:
             return None  # ICP ran away
         axis = total[:3, :3] @ turn @ model.axis
-        apex = total[:3, :3] @ (turn @ (model.top * model.axis)) + total[:3, 3]
+        apex = total[:3, :3] @ top + total[:3, 3]
         before, sample = np.asarray(source.points), np.asarray(target.points)
         after = before @ total[:3, :3].T + total[:3, 3]
         clouds = (cloud * size + center for cloud in (sample, before, after))
         fitness = float(min(result.fitness, 1.0))
         return Alignment(axis / np.linalg.norm(axis), apex * size + center, fitness, *clouds)
+
+    def _stayed(self, moved: Floats, up: Floats, top: Floats) -> bool:
+        """Return whether a motion (4, 4), in radii about the rim's centre, can be a mushroom's."""
+        leans = up @ moved[:3, :3] @ up < np.cos(np.radians(self.steepest_deg))
+        shifts = moved[:3, 3], moved[:3, :3] @ top + moved[:3, 3] - top  # of centre and apex
+        return bool(not leans and np.linalg.norm(shifts, axis=1).max() <= _FARTHEST)
 
     def _orient(self, o3d: Any, cloud: Any, eye: Floats) -> None:
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(3 * self.voxel, 30))

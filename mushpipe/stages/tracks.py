@@ -133,7 +133,8 @@ def _moved(old: Sightings, new: Sightings, image: tuple[int, int]) -> tuple[Sigh
     """
     flat = _flat(new, old)
     stayed = (flat <= 1).any(axis=0).sum()
-    if min(len(new), len(old)) < FEWEST or stayed > 0.9 * min(len(new), len(old)):
+    fewer = min(len(new), len(old))
+    if fewer < FEWEST or (stayed > 0.9 * fewer and _at_rest(new, old)):
         return old, flat
     shifted = replace(old, center=old.center + _common_shift(new, old))
     apart = _flat(new, shifted)
@@ -146,6 +147,15 @@ def _moved(old: Sightings, new: Sightings, image: tuple[int, int]) -> tuple[Sigh
     # without a shift in 3D the assignment falls back to the image
     step = np.median(known, axis=0) if len(known) else np.full(3, np.nan)
     return replace(shifted, position=old.position + step), apart
+
+
+def _at_rest(new: Sightings, old: Sightings) -> bool:
+    """Return whether most old mushrooms moved so little that even the smallest stays in its gate.
+
+    Large ones may all be in theirs after a step that takes the small ones out of it.
+    """
+    step = np.median(_steps(new.center, old.center).min(axis=0))
+    return bool(step < GATE / 2 * min(new.radius.min(), old.radius.min()))
 
 
 def _common_shift(new: Sightings, old: Sightings) -> Floats:

@@ -84,9 +84,9 @@ def test_depth_in_metres_from_sensor_units():
 
 
 def test_depth_in_metres_from_floats_keeps_no_nonsense():
-    native = np.array([[0, -1, np.nan, np.inf, 0.5]], np.float32)
-    frame = RgbdFrame(HEADER, np.zeros((1, 5, 3), np.uint8), native, 1.0)
-    np.testing.assert_array_equal(frame.depth_m[0], [np.nan] * 4 + [0.5])
+    native = np.array([[0, -1, np.nan, np.inf, 1e30, 0.5]], np.float32)
+    frame = RgbdFrame(HEADER, np.zeros((1, 6, 3), np.uint8), native, 1.0)
+    np.testing.assert_array_equal(frame.depth_m[0], [np.nan] * 5 + [0.5])
 
 
 def test_a_frame_without_depth_has_none_anywhere():

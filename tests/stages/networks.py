@@ -13,13 +13,13 @@ IMAGE: list[int | str] = [1, 3, "h", "w"]
 
 def saved(
     path: Path, nodes: list[Any], constants: dict[str, np.ndarray], image: list[int | str] = IMAGE,
-    kind: int = TensorProto.FLOAT, **facts: str,
+    numbers: int = TensorProto.FLOAT, **facts: str,
 ) -> Path:  # fmt: skip
-    """Write a network from `image`, of a kind of numbers, to `found`."""
+    """Write a network from `image`, of these numbers, to `found`; `facts` are its metadata."""
     graph = helper.make_graph(
         nodes,
         "tiny",
-        [helper.make_tensor_value_info("image", kind, image)],
+        [helper.make_tensor_value_info("image", numbers, image)],
         [helper.make_tensor_value_info("found", TensorProto.FLOAT, None)],
         [numpy_helper.from_array(np.asarray(v, np.float32), k) for k, v in constants.items()],
     )

@@ -97,3 +97,13 @@ def test_far_cells_are_the_far_percentile(seed: int, share: float, cell: int) ->
             x, y, z = far[i, j]
             assert z == known[len(known) // 10] == depth[int(y), int(x)]
             assert (int(y) // cell, int(x) // cell) == (i, j)
+
+
+@pytest.mark.parametrize("size", [(240, 320), (239, 319), (231, 310)])
+@pytest.mark.parametrize("relief", [True, False])
+def test_a_leaning_plane_goes_on_to_the_border(size: tuple[int, int], relief: bool) -> None:
+    height, width = size
+    plane = (-0.45 / (RAY @ normal_of(20, 250)))[:height, :width]
+    found = bed_depth(plane.astype(np.float32), relief)
+    assert found is not None
+    assert found == pytest.approx(plane, abs=3e-4)

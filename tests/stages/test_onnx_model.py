@@ -189,7 +189,7 @@ def test_a_box_far_larger_than_the_image_is_drawn(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", [TensorProto.FLOAT16, TensorProto.DOUBLE])
 def test_images_of_other_floats_are_taken(tmp_path: Path, kind: int) -> None:
     node = helper.make_node("Cast", ["image"], ["found"], to=TensorProto.FLOAT)
-    model = saved(tmp_path / "m.onnx", [node], {}, kind=kind)
+    model = saved(tmp_path / "m.onnx", [node], {}, numbers=kind)
     color = np.full((32, 64, 3), 255, np.uint8)
     mask, _ = Onnx(model=model, output="probabilities").process(RgbdFrame(HEADER, color))
     assert mask.foreground.all()
@@ -197,7 +197,7 @@ def test_images_of_other_floats_are_taken(tmp_path: Path, kind: int) -> None:
 
 def test_an_input_that_no_image_fits_is_refused_before_a_frame(tmp_path: Path) -> None:
     node = helper.make_node("Cast", ["image"], ["found"], to=TensorProto.FLOAT)
-    whole = saved(tmp_path / "whole.onnx", [node], {}, kind=TensorProto.UINT8)
+    whole = saved(tmp_path / "whole.onnx", [node], {}, numbers=TensorProto.UINT8)
     with pytest.raises(UsageError, match=r"its input is tensor\(uint8\), expected floats"):
         Onnx(model=whole, output="logits").open()
     eight = answering(tmp_path / "eight.onnx", np.zeros((8, 5, 7)), image=[8, 3, 96, 96])

@@ -14,7 +14,7 @@ from mushpipe.stages.phase_hough import PhaseHough
 from tests.stages.frames import field_data, recorded
 
 HEIGHT, WIDTH = 120, 160  # of the height map, half of the image
-EXACT = 6.0  # px of the image: three of the map; heights are looked at in every second
+EXACT = 7.5  # px of the image: nearly four of the map; heights are looked at in every second
 
 
 def relief(height: np.ndarray) -> Relief:

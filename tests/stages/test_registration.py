@@ -179,3 +179,19 @@ def test_locations_may_come_from_any_stage() -> None:
         frame_from(depth, gray), circles, locations, np.random.default_rng(0)
     )
     assert poses.valid.all()
+
+
+@pytest.mark.parametrize("start", ["none", "fgr"])
+@pytest.mark.parametrize("local", ["point-to-point", "point-to-plane"])
+def test_a_model_that_slid_off_gives_no_pose(local: str, start: str) -> None:
+    """A smooth cap that leans holds an error along its normals nowhere."""
+    steep = stage(model="mushroom", local=local, **{"global": start})
+    center, poses = np.array([0.03, -0.02, 0.4]), 0
+    for tilt, turn in [(25, 20), (30, 110), (40, 200), (40, 20)]:
+        points, axis = seen(tilt, turn)
+        found = steep.register(points, center, 0.02, UP)
+        if found is not None:
+            poses += 1
+            assert np.linalg.norm(found.apex - (center + 0.62 * 0.02 * axis)) < 0.02
+            assert angle(found.axis, axis) < 60
+    assert local == "point-to-plane" or poses == 4

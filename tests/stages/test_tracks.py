@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -116,3 +118,25 @@ def test_one_that_moves_alone_does_not_move_the_others() -> None:
     places = [(20.0, 30.0, 0.5), (60.0, 30.0, 0.5), (100.0, 30.0, 0.5), (140.0, 30.0, 0.5)]
     ids(tracks, *places)
     assert ids(tracks, (30.0, 30.0, 0.5), *places[1:], at=1) == [4, 1, 2, 3]
+
+
+def test_a_step_that_only_the_large_ones_stay_in_their_gate_at_takes_no_id_away() -> None:
+    """22 of 24 are within half a radius of where they were, the small ones are not."""
+    grid = [(40.0 * x + 20, 40.0 * y + 20, 0.5) for x in range(6) for y in range(4)]
+    radius = np.where(np.arange(len(grid)) % 12 == 5, 6.0, 18.0)
+    for depth in (0.5, np.nan):
+        tracks, found = Tracks(), []
+        for step in range(4):
+            rows = [(u + 5 * step, v + 2 * step, depth) for u, v, _ in grid]
+            circles, locations = seen(*rows)
+            sized = replace(circles, radius=radius)
+            found.append(
+                tracks.update(
+                    sized,
+                    replace(locations, diameter=2 * radius * 0.5 / CAMERA.fx),
+                    IMAGE,
+                    step,
+                    10,
+                ).tolist()
+            )
+        assert found == [found[0]] * 4
