@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mushpipe import Camera
 from mushpipe.stages.bed import bed_depth, far_cells, fit_plane, plane_depth
-from mushpipe.stages.upright import bed_normal
+from mushpipe.stages.upright import bed_normal, pixel_rays
 
 V, U = np.mgrid[:240, :320].astype(float)
 RAY = np.stack([(U - 159.5) / 300, (V - 119.5) / 300, np.ones_like(U)], axis=-1)
@@ -107,3 +108,23 @@ def test_a_leaning_plane_goes_on_to_the_border(size: tuple[int, int], relief: bo
     found = bed_depth(plane.astype(np.float32), relief)
     assert found is not None
     assert found == pytest.approx(plane, abs=3e-4)
+
+
+LENSES = {  # px and coefficients at 640 x 480, as the cameras' colour streams have them
+    "D435": (605.0, (-0.055, 0.065, 0.0, 0.0, -0.02)),
+    "D405": (435.0, (-0.054, 0.058, 0.0, 0.0, -0.02)),
+    "pincushion": (605.0, (0.15, -0.5, 0.0, 0.0, 0.45)),
+}
+
+
+@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("turn", [0, 45, 200])
+def test_a_camera_s_lens_bends_the_plane_of_pixels_little(lens: str, turn: float) -> None:
+    f, coefficients = LENSES[lens]
+    rays = pixel_rays(Camera(640, 480, f, f, 319.5, 239.5, "brown_conrady", coefficients))
+    seen = np.dstack([rays, np.ones(rays.shape[:2])]) @ normal_of(20, turn)
+    plane = (-0.45 * np.cos(np.radians(20)) / seen).astype(np.float32)
+    found = bed_depth(plane)
+    assert found is not None
+    assert found == pytest.approx(plane, abs=1e-3)
+    assert np.abs(found - plane).mean() < 2e-4
