@@ -20,13 +20,13 @@ from mushpipe.core.geometry import Camera
 from mushpipe.core.recording import Raw
 from mushpipe.core.stage import Source
 from mushpipe.core.types import Header, RgbdFrame
+from mushpipe.sources.doubts import doubts
 from mushpipe.sources.images import decode_camera, decode_color, decode_depth, distortion
 from mushpipe.sources.pairing import Pairing
 from mushpipe.sources.topics import Topics, is_beside, says_aligned
 
 T = TypeVar("T")
 logger = logging.getLogger("mushpipe")
-FARTHEST_M = 30.0
 MOST_BESIDE = 256  # frames of which something waits that was recorded beside them
 NO_DEPTH = "%s has no depth: positions, distances and diameters will be missing"
 
@@ -258,17 +258,11 @@ class Player:
             )
 
     def _judge_depth(self, sequence: int, depth: NDArray[Any]) -> None:
-        """Warn, once, of depth (m) that no camera above a bed can have measured."""
+        """Warn, once, of depth (m) that no camera above a bed can have measured, or a poor one."""
         known = depth[np.isfinite(depth) & (depth > 0)]
         self._judged = len(known) > 0
-        if self._judged and (far := float(np.median(known))) > FARTHEST_M:
-            logger.warning(
-                "%s, frame %d: half of the depth is beyond %.0f m; where it is in millimetres, "
-                "set source.depth_scale: 0.001",
-                self.name,
-                sequence,
-                far,
-            )
+        for doubt in doubts(known):
+            logger.warning("%s, frame %d: %s", self.name, sequence, doubt)
 
     def _camera(self, size: tuple[int, ...], recorded: Camera | None) -> Camera | None:
         given = self.settings.camera

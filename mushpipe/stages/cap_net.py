@@ -34,6 +34,7 @@ _BLOCK = 32  # px; the coarsest stride
 # px; radii that the training showed. A range beyond them is brought there by scaling the image.
 _KNOWN = (7.0, 60.0)
 _LARGEST_SCALE = 4.0
+_LEAST_KNOWN = 0.35  # share of the pixels with depth from which on depth tells enough
 
 
 class CapNet(Stage):
@@ -52,8 +53,8 @@ class CapNet(Stage):
         1.0,
         ge=0.5,
         le=1,
-        description="scale of the image where the frame has depth, for a detector that uses it: "
-        "it needs less of the network, and 0.8 takes two thirds of the time",
+        description="scale of the image where a third of the frame has depth, for a detector that "
+        "uses it: it needs less of the network, and 0.8 takes two thirds of the time",
     )
     min_score: float = Field(
         0.527, ge=0, le=1, description="smallest score that is kept; chosen on simulated beds"
@@ -103,7 +104,7 @@ class CapNet(Stage):
             UsageError: The model's output has not the shape of `cap-net`.
         """
         height, width = frame.color.shape[:2]
-        scale = self.scale() * (1 if frame.depth is None else self.beside_depth)
+        scale = self.scale() * (self.beside_depth if _has_depth(frame) else 1)
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
         maps = self._maps(frame.color if scale == 1 else resized(frame.color, size))
         # pixel x of the frame lies at ratio (x + 1/2) - 1/2 of the scaled image
@@ -153,6 +154,11 @@ class CapNet(Stage):
                 f"model {net.path}: its output has shape {maps.shape}, expected {expected}"
             )
         return np.asarray(maps[0], np.float32)
+
+
+def _has_depth(frame: RgbdFrame) -> bool:
+    """Return whether the frame has so much depth that a detector can rely on it."""
+    return frame.depth is not None and bool((frame.depth[::8, ::8] > 0).mean() >= _LEAST_KNOWN)
 
 
 @borrower

@@ -94,6 +94,17 @@ def test_beside_depth_the_image_is_scaled_and_the_answer_scaled_back() -> None:
     assert np.median(found.radius / truth.radius[nearest]) == pytest.approx(1, abs=0.03)
 
 
+def test_where_hardly_any_depth_is_known_the_whole_image_is_looked_at() -> None:
+    frame = first("first-bed")
+    alone = CapNet().process(replace(frame, depth=None))[1]
+    assert frame.depth is not None
+    for kept in (0, 60):  # of 640 columns
+        poor = frame.depth.copy()
+        poor[:, kept:] = 0
+        found = CapNet(beside_depth=0.8).process(replace(frame, depth=poor))[1]
+        assert np.array_equal(found.score, alone.score)
+
+
 @pytest.mark.parametrize("shape", [(1, 1), (5, 70), (33, 65), (130, 31), (240, 320)])
 def test_an_image_of_any_size_gives_a_mask_of_its_size(shape: tuple[int, int]) -> None:
     noise = np.random.default_rng(1).integers(0, 256, (*shape, 3), np.uint8)

@@ -1,0 +1,35 @@
+"""What speaks against depth before anything is measured in it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FARTHEST_M = 30.0
+COARSE_M = 0.003  # a cap of 30 mm rises by 9
+_FEWEST_LEVELS = 6
+
+
+def doubts(depth: NDArray[Any]) -> Iterator[str]:
+    """Yield what is odd about depths (N,), m, none of them missing, and what to do about it."""
+    if not len(depth):
+        return
+    if (far := float(np.median(depth))) > FARTHEST_M:
+        yield (
+            f"half of the depth is beyond {far:.0f} m; where it is in millimetres, set "
+            "source.depth_scale: 0.001"
+        )
+    elif (step := _step(depth)) > COARSE_M:
+        yield (
+            f"depth comes in steps of {1000 * step:.0f} mm, too coarse for the form of caps, "
+            "which may be missed; record it finer (stereo cameras may have a mode called subpixel)"
+        )
+
+
+def _step(depth: NDArray[Any]) -> float:
+    """Return the usual step between depths (N,), m; 0 where they are too few to tell."""
+    levels = np.unique(depth)
+    return float(np.median(np.diff(levels))) if len(levels) >= _FEWEST_LEVELS else 0.0

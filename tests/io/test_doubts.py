@@ -1,0 +1,43 @@
+"""What is said of odd depth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mushpipe.sources.doubts import doubts
+from tests.stages.frames import recorded
+
+RELIEF = np.random.default_rng(0).uniform(0.4, 0.5, 4800)  # m, a bed and its caps
+
+
+@given(st.floats(0.1, 30))
+def test_depth_in_coarse_steps_is_doubted_and_no_other(step_mm: float) -> None:
+    step = step_mm / 1000
+    found = list(doubts(np.rint(RELIEF / step) * step))
+    levels = round(0.1 / step)
+    if step_mm < 2.9:
+        assert not found
+    elif step_mm > 3.1 and levels >= 7:
+        assert len(found) == 1
+        assert f"in steps of {step_mm:.0f} mm" in found[0]
+
+
+def test_disparities_without_fractions_are_doubted() -> None:
+    """A base of 75 mm and 441 px of focal length, half a metre away."""
+    product = 0.075 * 441
+    assert list(doubts(product / np.rint(product / RELIEF)))
+    assert not list(doubts(product / (np.rint(32 * product / RELIEF) / 32)))
+
+
+@pytest.mark.parametrize("depth", [np.zeros(0), np.full(100, 0.4), np.repeat([0.4, 0.5], 50)])
+def test_what_has_few_levels_is_not_doubted(depth: np.ndarray) -> None:
+    assert not list(doubts(depth))
+
+
+@pytest.mark.parametrize("name", ["desk-july", "desk-june", "white-bed-0"])
+def test_real_depth_is_not_doubted(name: str) -> None:
+    for frame in recorded(name):
+        assert not list(doubts(frame.depth_m[np.isfinite(frame.depth_m)]))
