@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 FARTHEST_M = 30.0
 COARSE_M = 0.003  # a cap of 30 mm rises by 9
 _FEWEST_LEVELS = 6
+_FEWEST_EACH = 8  # depths a level: unlike steps, chance seldom meets a level twice
 
 
 def doubts(depth: NDArray[Any]) -> Iterator[str]:
@@ -32,4 +33,6 @@ def doubts(depth: NDArray[Any]) -> Iterator[str]:
 def _step(depth: NDArray[Any]) -> float:
     """Return the usual step between depths (N,), m; 0 where they are too few to tell."""
     levels = np.unique(depth)
-    return float(np.median(np.diff(levels))) if len(levels) >= _FEWEST_LEVELS else 0.0
+    if not _FEWEST_LEVELS <= len(levels) <= len(depth) / _FEWEST_EACH:
+        return 0.0
+    return float(np.median(np.diff(levels)))

@@ -37,6 +37,11 @@ def test_what_has_few_levels_is_not_doubted(depth: np.ndarray) -> None:
     assert not list(doubts(depth))
 
 
+@given(st.integers(0, 2**32), st.integers(6, 300))
+def test_depths_that_are_few_and_far_apart_by_chance_are_not_doubted(seed: int, n: int) -> None:
+    assert not list(doubts(np.random.default_rng(seed).uniform(0.1, 8, n)))
+
+
 @pytest.mark.parametrize("name", ["desk-july", "desk-june", "white-bed-0"])
 def test_real_depth_is_not_doubted(name: str) -> None:
     for frame in recorded(name):
