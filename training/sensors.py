@@ -15,29 +15,14 @@ Singles = NDArray[np.float32]
 
 
 def worse(frame: RgbdFrame, rng: np.random.Generator) -> RgbdFrame:
-    """Return a frame with blurred, coarser, shifted, noisier depth that lacks edges and patches."""
+    """Return a frame with coarser, shifted, noisier depth that lacks edges and patches."""
     if frame.depth is None:
         return frame
     depth = frame.depth.astype(np.float32) * np.float32(frame.depth_scale)
-    for damage in (_matched, _coarser, _shifted, _noisier, _without_edges, _with_holes):
+    for damage in (_coarser, _shifted, _noisier, _without_edges, _with_holes):
         depth = damage(depth, rng)
     native = np.clip(np.rint(depth / frame.depth_scale), 0, 65535).astype(np.uint16)
     return replace(frame, depth=native)
-
-
-def _matched(depth: Singles, rng: np.random.Generator) -> Singles:
-    """As a stereo camera matches it, in windows of 3 to 7 px, in half of the frames.
-
-    What is near grows by half a window, and what is small or steep is smoothed.
-    """
-    half = int(rng.integers(-2, 4))
-    if half <= 0:
-        return depth
-    window, known = (2 * half + 1, 2 * half + 1), depth > 0
-    near = cv2.erode(np.where(known, depth, np.float32(np.inf)), np.ones(window, np.uint8))
-    share = cv2.blur(known.astype(np.float32), window)
-    mean = cv2.blur(np.where(known, near, np.float32(0)), window) / np.maximum(share, 1e-6)
-    return np.where(known, mean, np.float32(0))
 
 
 def _coarser(depth: Singles, rng: np.random.Generator) -> Singles:
