@@ -101,7 +101,9 @@ class Results:
         """Frames that a stage took its results to from the camera's."""
         stages = self.manifest.get("graph", {}).get("stages", {}).values()
         transforms = (stage.get("T_base_camera") for stage in stages)
-        return {transform["frame"] for transform in transforms if transform}
+        # a stage of somebody else may call something else so
+        known = (each for each in transforms if isinstance(each, dict) and "frame" in each)
+        return {str(transform["frame"]) for transform in known}
 
 
 def read_results(path: Path, topic: str | None = None) -> Results:

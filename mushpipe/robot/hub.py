@@ -217,6 +217,7 @@ class Hub:
             Refusal: See `Ledger.apply`; `stale` where a robot accepts a target, not one that it
                 holds already, and nobody knows any more whether it is there.
         """
+        self.ledger.settle(now)  # a claim that has just ended is none
         if outcome == "accepted" and not self.ledger.hides(target):
             self.fresh(now, self.settings.max_age_s)
         listed = self.newest.choice.targets if self.newest else ()

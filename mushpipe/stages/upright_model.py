@@ -81,6 +81,7 @@ def read(path: Path, spacing: float) -> Model:
     o3d = import_open3d()
     mesh = o3d.io.read_triangle_mesh(str(path))
     if len(mesh.triangles):
+        o3d.utility.random.seed(0)  # the same model in every run
         cloud = mesh.sample_points_uniformly(20_000, use_triangle_normal=True)
     else:
         cloud = o3d.io.read_point_cloud(str(path))

@@ -150,6 +150,13 @@ def test_no_depth_gives_no_pose_and_no_calibration_an_error() -> None:
         stage().process(frame_from(depth, gray, None), circles, locations, np.random.default_rng(0))
 
 
+def test_a_mesh_is_the_same_model_each_time_it_is_read(tmp_path) -> None:
+    mesh = o3d.geometry.TriangleMesh.create_sphere(radius=20)
+    o3d.io.write_triangle_mesh(str(tmp_path / "m.ply"), mesh)
+    first, second = (read(tmp_path / "m.ply", 0.1) for _ in range(2))
+    np.testing.assert_array_equal(first.points, second.points)
+
+
 def test_a_model_of_the_users_own_is_read_in_any_unit(tmp_path) -> None:
     own = made(full=True, spacing=0.05)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(own.points * 40 + [7, -3, 90]))
