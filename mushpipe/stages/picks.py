@@ -157,11 +157,18 @@ class MakePicks(Stage):
             (PickFlag.TILT_UNOBSERVABLE, poses.valid & ~(poses.sigma_rad < tilt_sigma)),
             (
                 PickFlag.TOO_CLOSE_TO_NEIGHBOUR,
-                1000 * clearance(circles, locations) < self.clearance_mm,
+                1000 * clearance(circles, locations, self._above(locations)) < self.clearance_mm,
             ),
         ):
             flags[where] |= np.uint32(flag)
         return flags
+
+    def _above(self, locations: Locations) -> NDArray[np.float64]:
+        """Return where positions (N, 2), m, lie seen from above: along the robot's z if known."""
+        place = locations.position
+        if self.T_base_camera is not None:
+            place = self.T_base_camera.points(place)
+        return place[:, :2]
 
     def _chosen(
         self, picks: Picks, up: NDArray[np.float64], hidden: NDArray[np.float64]

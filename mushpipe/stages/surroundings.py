@@ -53,19 +53,24 @@ def covered(ranks: NDArray[np.int16], discs: Floats, rank: NDArray[np.int64]) ->
     return shares
 
 
-def clearance(circles: Circles, locations: Locations) -> Floats:
+def clearance(circles: Circles, locations: Locations, above: Floats) -> Floats:
     """Return the gap (N,) m between each cap's outline and the nearest other one, from above.
+
+    Args:
+        circles: Outlines, px.
+        locations: Diameters, and which positions are known.
+        above: (N, 2) m, the positions as they lie seen from above.
 
     Caps overlap where it is negative. A neighbour whose place or size in metres is unknown is taken
     to be as far away as the cap itself, for room that nobody measured is not free. Infinite for a
     mushroom alone; NaN where its own position or diameter is unknown.
     """
-    radius, place = locations.diameter / 2, locations.position[:, :2]
+    radius = locations.diameter / 2
     pixel = radius / circles.radius  # m
-    gaps = _gaps(place, radius)
+    gaps = _gaps(above, radius)
     seen = pixel[:, None] * _gaps(circles.center, circles.radius)
     gap = np.where(np.isnan(gaps), seen, gaps).min(axis=1, initial=np.inf)
-    return np.where(np.isfinite(radius + place[:, 0]), gap, np.nan)
+    return np.where(np.isfinite(radius + above[:, 0]), gap, np.nan)
 
 
 def _gaps(place: Floats, radius: Floats) -> Floats:

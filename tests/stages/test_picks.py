@@ -249,6 +249,19 @@ def test_room_for_the_gripper_is_the_gap_between_the_outlines() -> None:
     assert not alone.flags[0] & PickFlag.TOO_CLOSE_TO_NEIGHBOUR
 
 
+def test_room_is_seen_from_above_where_the_camera_leans() -> None:
+    leans = Rotation.from_euler("x", 150, degrees=True)  # 30 degrees off straight down
+    base = {"frame": "base", "translation": (0, 0, 0.6), "quaternion": leans.as_quat().tolist()}
+    rows = [(80, 60, 0.5, 0.04), (80, 90, 0.53, 0.04)]
+    points = np.array([((v - 59.5) * z / 200, z) for _, v, z, _ in rows])  # y and z
+    apart = np.diff(points @ [np.cos(np.radians(150)), -np.sin(np.radians(150))])
+    gap = 1000 * (float(np.abs(apart[0])) - 0.04)
+    for clearance, flagged in ((gap - 0.5, False), (gap + 0.5, True)):
+        picks = picked(rows, clearance_mm=clearance, T_base_camera=base)
+        close = (picks.flags & PickFlag.TOO_CLOSE_TO_NEIGHBOUR) > 0
+        assert close.tolist() == [flagged, flagged]
+
+
 def test_a_neighbour_without_depth_takes_room_as_well() -> None:
     # 40 px to the left, 16 px between outlines; the cap's 20 mm of radius are 12 px: 26.7 mm.
     rows = [(80, 60, 0.5, 0.04), (40, 60, NAN, NAN)]
