@@ -218,7 +218,8 @@ class Hub:
                 holds already, and nobody knows any more whether it is there.
         """
         self.ledger.settle(now)  # a claim that has just ended is none
-        if outcome == "accepted" and not self.ledger.hides(target):
+        held = self.ledger.hides(target) and not self.ledger.put_off(target)
+        if outcome == "accepted" and not held:
             self.fresh(now, self.settings.max_age_s)
         listed = self.newest.choice.targets if self.newest else ()
         visible = any(target == known.id for known in listed)

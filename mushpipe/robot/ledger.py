@@ -15,6 +15,7 @@ MOST_ENTRIES = 4096
 class _Entry:
     owner: str
     until: float
+    accepted: bool  # else it was only put off
 
 
 class Ledger:
@@ -40,6 +41,10 @@ class Ledger:
         """Return whether a target is not to be offered to anybody."""
         return target in self._entries or target in self._done
 
+    def put_off(self, target: int) -> bool:
+        """Return whether a target is hidden though no robot is on its way to it."""
+        return target in self._entries and not self._entries[target].accepted
+
     def apply(
         self, owner: str, target: int, outcome: Outcome, hold_s: float, visible: bool, now: float
     ) -> Literal["removed", "restored"]:
@@ -47,12 +52,14 @@ class Ledger:
 
         Raises:
             Refusal: `conflict` where another robot holds the target, `unknown_target` where it is
-                neither visible nor held, `busy` where too many are held.
+                neither visible nor held, or accepted unseen after it was put off, `busy` where too
+                many are held.
         """
         self.settle(now)
         entry = self._entries.get(target)
         holder = self._done.get(target, entry.owner if entry else None)
-        if holder is None and not visible:
+        new = holder is None or (outcome == "accepted" and holder == owner and self.put_off(target))
+        if new and not visible:
             raise Refusal("unknown_target", f"m{target} is neither visible nor accepted")
         if holder not in (None, owner):
             raise Refusal("conflict", f"m{target} is held, or done, by another robot")
@@ -68,6 +75,6 @@ class Ledger:
             return "removed"
         if held:
             wait = self._claim_s if outcome == "accepted" else hold_s
-            self._entries[target] = _Entry(owner, now + wait)
+            self._entries[target] = _Entry(owner, now + wait, outcome == "accepted")
             return "removed"
         return "restored"

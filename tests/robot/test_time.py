@@ -245,3 +245,12 @@ def test_a_client_that_reads_is_not_cut_off_for_targets_that_age_while_they_are_
         connection.serve()
         assert theirs.recv(100) == b"targets\n"
         assert not connection.gone
+
+
+def test_what_was_put_off_is_accepted_only_where_it_is_seen() -> None:
+    ledger = Ledger()
+    assert ledger.apply("a", 1, "failed", 3600, visible=True, now=0) == "removed"
+    with pytest.raises(Refusal, match="neither visible"):
+        ledger.apply("a", 1, "accepted", 0, visible=False, now=1800)
+    assert ledger.apply("a", 1, "accepted", 0, visible=True, now=1801) == "removed"
+    assert ledger.apply("a", 1, "accepted", 0, visible=False, now=1802) == "removed"  # its own
