@@ -139,7 +139,9 @@ def _moved(old: Sightings, new: Sightings, image: tuple[int, int]) -> tuple[Sigh
     shifted = replace(old, center=old.center + _common_shift(new, old))
     apart = _flat(new, shifted)
     near = apart <= 1
-    in_view = ((shifted.center >= 0) & (shifted.center < image)).all(axis=1).sum()
+    # Of those seen before the last picture nobody knows whether they are still where they were.
+    latest = old.seen_ns == old.seen_ns.max()
+    in_view = (latest[:, None] & (shifted.center >= 0) & (shifted.center < image)).all(axis=1).sum()
     if near.any(axis=0).sum() < max(FEWEST, stayed + 1, 0.5 * in_view):
         return old, flat
     deep = (new.position[:, None] - old.position[None])[near]

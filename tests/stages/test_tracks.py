@@ -140,3 +140,17 @@ def test_a_step_that_only_the_large_ones_stay_in_their_gate_at_takes_no_id_away(
                 ).tolist()
             )
         assert found == [found[0]] * 4
+
+
+def test_after_a_turn_to_another_bed_ids_follow_its_shifts_at_once() -> None:
+    """What was seen before the turn is remembered in the same places of the image."""
+    rng = np.random.default_rng(1)
+    grid = np.array([(x, y) for x in range(20, 300, 24) for y in range(20, 220, 24)], float)
+    first, second = grid[:60], rng.permutation(grid + 12)[:25]
+    tracks = Tracks()
+    tracks.update(*seen(*((u, v, 0.5) for u, v in first)), (320, 240), 0, 10**9)
+    names = []
+    for step in range(4):
+        rows = [(u + 10.0 * step, v, 0.5) for u, v in second]
+        names.append(tracks.update(*seen(*rows), (320, 240), 1 + step, 10**9).tolist())
+    assert names[1:] == names[:1] * 3
