@@ -12,6 +12,8 @@ TOLERANCE_S = 0.02
 STEP_S = 0.002
 # Most that two clocks drift apart, s/s: quartzes of cameras and hosts do by a quarter of it.
 DRIFT = 2e-4
+SET_S = 0.5  # a clock that gains so much from one frame to the next was set
+PACED_S = 1.0
 # Time spent in suspend must age a target, too; CLOCK_MONOTONIC stands still meanwhile.
 _MONOTONIC = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
 
@@ -96,24 +98,36 @@ class Lateness:
 
     The least delay so far counts as none. It may grow, as the clocks drift apart; a delay that
     grows faster comes from a queue or from a computer that stood still.
+
+    The first frames may have waited, too, and so may those after the clock was set. They count as
+    infinitely late until frames have come at the camera's pace for `PACED_S`: out of a queue that
+    empties they come faster.
     """
 
     def __init__(self) -> None:
-        self._anchor_ns, self._own_s, self._least = 0, 0.0, inf
+        self._anchor_ns, self._own_s, self._delay = 0, inf, inf
+        self._least = self._quickest = inf
+        self._paced_from = 0.0
 
     def of(self, own_ms: float, stamp_ns: int, arrived_s: float) -> float:
-        """Return the lateness of the next frame, s.
+        """Return the lateness of the next frame, s; infinite where it cannot be told.
 
         Args:
             own_ms: Its time on the camera's clock.
             stamp_ns: That as ns since the epoch; another difference of the two, or a time that went
                 back, says that nothing is known of its clock any more: the camera was lost, say.
+                A time that runs ahead of the arrivals may be a clock that was set.
             arrived_s: Monotonic time of its arrival.
         """
         own_s, anchor_ns = own_ms / 1e3, stamp_ns - round(own_ms * 1e6)
-        if abs(anchor_ns - self._anchor_ns) > 1e6 or own_s < self._own_s:
-            self._least = inf
         delay = arrived_s - own_s
+        lost = abs(anchor_ns - self._anchor_ns) > 1e6 or own_s < self._own_s
+        if lost:
+            self._least = inf
+        if lost or self._delay - delay > SET_S:
+            self._quickest = inf
+        if delay < self._quickest - TOLERANCE_S:
+            self._quickest, self._paced_from = delay, arrived_s
         self._least = min(delay, self._least + DRIFT * abs(own_s - self._own_s))
-        self._anchor_ns, self._own_s = anchor_ns, own_s
-        return delay - self._least
+        self._anchor_ns, self._own_s, self._delay = anchor_ns, own_s, delay
+        return delay - self._least if arrived_s - self._paced_from >= PACED_S else inf

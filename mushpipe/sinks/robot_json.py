@@ -9,6 +9,7 @@ import time
 from collections.abc import Mapping
 from importlib.metadata import version
 from ipaddress import ip_address
+from math import inf
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
 
@@ -221,10 +222,10 @@ class RobotJsonSink(Sink):
         placed = self._placer.place(stamp_ns)
         if placed is None:
             self._warn("the camera's time stamps are not of this host: robots get nothing")
-            return float("-inf")
+            return -inf
         if not shared:
             played -= late
-            if 1000 * late > self.max_age_ms:
+            if self.max_age_ms < 1000 * late < inf:
                 self._warn("frames come later than the quickest did, by more than 'max_age_ms'")
         return min(placed, played) - self.sensor_latency_ms / 1000
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import socket
+from math import inf
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mushpipe.robot.clock import MEMORY_S, TOLERANCE_S, Clock, Lateness, Placer
+from mushpipe.robot.clock import MEMORY_S, PACED_S, TOLERANCE_S, Clock, Lateness, Placer
 from mushpipe.robot.connection import Connection, Limits
 from mushpipe.robot.hub import Ending, Hub, Settings
 from mushpipe.robot.ledger import Ledger
@@ -199,15 +200,38 @@ def test_a_target_can_be_kept_away_for_a_while() -> None:
 def test_a_camera_whose_clock_drifts_is_late_by_its_queue_alone(
     steps: list[tuple[float, float]], drift: float
 ) -> None:
-    lateness, now, own = Lateness(), 0.0, 0.0
-    lateness.of(0.0, 10**18, 0.0)
+    lateness, now, own = Lateness(), PACED_S, PACED_S
+    for moment in (0.0, PACED_S):
+        known = lateness.of(1e3 * moment, 10**18 + round(1e9 * moment), moment)
+    assert known == 0
     for pause, queue in steps:
         now, own = now + pause, own + pause * (1 + drift)
         late = lateness.of(1e3 * own, 10**18 + round(1e9 * own), now + queue)
         assert queue - 1e-6 <= late + 3.1e-4 * now
-        assert late <= queue + 1e-6
+        assert late <= queue + 1e-6 or late == inf
     # Lost and found again: nothing is known of how its clock relates to ours.
-    assert lateness.of(0.0, 2 * 10**18, now + 500) == 0
+    assert lateness.of(0.0, 2 * 10**18, now + 500) == inf
+
+
+@given(
+    jump=st.floats(0.6, 10) | st.floats(-10, 0),
+    queue=st.floats(0, 10),
+    rate=st.floats(1.1, 30),
+    began=st.booleans(),
+)
+def test_what_waits_while_a_clock_is_set_or_at_the_start_is_never_called_fresh(
+    jump: float, queue: float, rate: float, began: bool
+) -> None:
+    """A queue of that many seconds empties at `rate` times the camera's pace."""
+    lateness, late = Lateness(), inf
+    emptied = queue * rate / (rate - 1)
+    for number in range(-60 if began else 0, 900):
+        taken = number / 30
+        arrived = taken if number < 0 else max(taken, queue + taken / rate)
+        stamp = taken + (jump if number > 0 else 0.0)
+        late = lateness.of(1e3 * stamp, round(1e9 * stamp), arrived)
+        assert arrived - taken <= late + 0.05
+    assert late <= 0.1 or emptied > 28
 
 
 class Ageing(FakeClock):
