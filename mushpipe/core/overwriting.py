@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 from collections.abc import Iterable, Mapping
+from io import FileIO
 from pathlib import Path
 
 from mushpipe.core.errors import UsageError
@@ -49,6 +51,23 @@ def make_folder(folder: Path) -> None:
         raise UsageError(f"{folder} cannot be a folder: {error.strerror}") from error
 
 
+def opened_alone(path: Path) -> FileIO:
+    """Open a file to write, made if need be and not emptied, that no other run is to write.
+
+    Raises:
+        UsageError: Another run is writing it.
+        OSError: It cannot be opened.
+    """
+    file = FileIO(path, "ab")
+    try:
+        if path.is_file():  # a device such as /dev/null is for everybody
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        file.close()
+        raise UsageError(f"{path} is being written by another run: give another name") from error
+    return file
+
+
 def spare_files(read: Iterable[Path], written: Mapping[str, Iterable[Path]]) -> None:
     """Refuse what sinks could not write, or not without harm, before any of them opens.
 
@@ -78,4 +97,9 @@ def _fault(path: Path) -> str:
         return f"there is no folder {path.parent}"
     if not os.access(path if path.exists() else path.parent, os.W_OK):
         return "permission denied"
+    if path.is_file():
+        try:
+            opened_alone(path).close()
+        except UsageError:
+            return "another run is writing it; give another name"
     return ""

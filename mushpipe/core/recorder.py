@@ -19,6 +19,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from mushpipe.core import wire
 from mushpipe.core.errors import MushpipeError, UsageError
 from mushpipe.core.geometry import Camera
+from mushpipe.core.overwriting import opened_alone
 from mushpipe.core.paths import STDIO
 from mushpipe.core.types import Header, RgbdFrame
 
@@ -185,16 +186,10 @@ class _Output:
 
 def _create(path: Path) -> FileIO:
     """Open a file that no other run is writing, and empty it."""
-    import fcntl
-
     try:
-        file = path.open("ab", buffering=0)
-        if path.is_file():  # a device such as /dev/null is for everybody
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        file = opened_alone(path)
+        if path.is_file():
             file.truncate(0)
-    except BlockingIOError as error:
-        file.close()
-        raise UsageError(f"{path} is being written by another run: give another name") from error
     except OSError as error:
         raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
     return file

@@ -12,6 +12,7 @@ import sys
 import time
 from collections import deque
 from contextlib import suppress
+from io import FileIO
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 from urllib.parse import urlsplit
@@ -20,6 +21,7 @@ from pydantic import Field, PrivateAttr, model_validator
 
 from mushpipe import Header, RunInfo, Sink, SinkPath, Trace
 from mushpipe.core.errors import DependencyError, UsageError
+from mushpipe.core.overwriting import opened_alone
 from mushpipe.core.recorder import RecordingError
 from mushpipe.core.transform import Transform, base_of
 from mushpipe.sinks.rerun_memory import Remembering
@@ -70,6 +72,7 @@ class RerunSink(Sink):
 
     _recording: Any = PrivateAttr(None)
     _path: Path | None = PrivateAttr(None)
+    _held: FileIO | None = PrivateAttr(None)
     _server: subprocess.Popen[bytes] | None = PrivateAttr(None)
     _notes: _Notes | None = PrivateAttr(None)
     _period_ns: int = PrivateAttr(0)
@@ -109,8 +112,9 @@ class RerunSink(Sink):
         sinks += [rr.GrpcSink(url) for url in self._viewers()]
         self._recording = rr.RecordingStream("mushpipe", recording_id=run.recording)
         try:
+            self._held = opened_alone(self._path) if self._path else None  # set_sinks empties it
             self._recording.set_sinks(*sinks)
-        except RuntimeError as error:
+        except (OSError, RuntimeError) as error:
             raise UsageError(f"save: {self.save} cannot be written: {error}") from error
         self._memories = (Remembering(self._recording), Remembering(self._recording))
         graph = run.manifest.get("graph", {})
@@ -218,6 +222,8 @@ class RerunSink(Sink):
                 logger.warning("the viewer did not take everything: %s", error)
             self._recording.disconnect()
             self._recording = None
+        if self._held is not None:
+            self._held.close()
         if self._server is not None:
             os.killpg(self._server.pid, signal.SIGTERM)  # the command starts a child
             self._server.wait()

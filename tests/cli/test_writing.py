@@ -6,7 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from mushpipe import RunInfo
 from mushpipe.core.errors import EXIT_USAGE
+from mushpipe.sinks.mcap import McapSink
+from mushpipe.sinks.rerun import RerunSink
 from tests.cli.test_commands import GRAPH, mushpipe
 
 
@@ -99,6 +102,28 @@ def test_a_sink_of_ones_own_is_kept_from_its_source_by_the_type_of_its_path(fold
     assert done.returncode == EXIT_USAGE
     assert "sink 'mine' would write over what the run reads" in done.stderr
     assert (folder / "a.mcap").read_bytes() == before
+
+
+@pytest.mark.parametrize("held", ["out.mcap", "out.rrd"])
+def test_nothing_is_emptied_where_another_run_writes_one_of_the_files(
+    folder: Path, held: str
+) -> None:
+    text = (folder / "graph.yaml").read_text()
+    (folder / "graph.yaml").write_text(text + "  look: {use: rerun, save: ./out.rrd}\n")
+    run = RunInfo("synthetic", {})
+    sink = RerunSink(save=folder / held) if held == "out.rrd" else McapSink(path=folder / held)
+    sink.open(run)
+    other = folder / ({"out.mcap", "out.rrd"} - {held}).pop()
+    other.write_bytes(b"of the first run")
+    before = (folder / held).read_bytes()
+    options = ("--source", "synthetic", "--frames", 1, "--set", "log.path=./out.mcap")
+    done = mushpipe("run", "graph.yaml", *options, cwd=folder)
+    assert done.returncode == EXIT_USAGE
+    assert f"{held} cannot be written: another run is writing it" in done.stderr
+    assert other.read_bytes() == b"of the first run"
+    assert (folder / held).read_bytes().startswith(before)
+    sink.close()
+    assert mushpipe("run", "graph.yaml", *options, cwd=folder).returncode == 0
 
 
 @pytest.mark.parametrize(
