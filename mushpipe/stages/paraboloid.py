@@ -35,6 +35,9 @@ BEND = 0.3  # sigma of the quadratic coefficients about those of a cap, in radii
 ASPECT = 0.62  # height of a dome over the radius of its rim
 POINTED = 0.2  # sigma of the slope of a pointed top, less in its innermost BLUNT radii
 BLUNT = 0.15
+FARTHEST = (
+    2.0  # radii from the middle depth; no cap's top is, only what a fit makes of a hole's rim
+)
 INNER = np.flatnonzero((CELLS**2).sum(axis=1) < DISC**2)
 
 
@@ -75,6 +78,9 @@ def fit_surfaces(
         n, middle = sample_inner(image, rank[i], discs[i], focal, noise, cut, near)
         size = discs[i, 2] * middle / focal
         if n >= least and paraboloid(near, n, size, weighted, out[0][k], out[1][k]):
+            if not abs(out[0][k, 0]) < min(FARTHEST * size, middle):
+                out[0][k], out[1][k] = np.nan, np.nan
+                continue
             out[0][k, 0] += middle
             gate = (middle - 0.8 * size, middle + size)
             seen[k, 0], seen[k, 1] = count_seen(image, rank[i], discs[i], gate)

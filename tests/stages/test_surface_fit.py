@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,6 +14,7 @@ from mushpipe.sim.shapes import CapShape, Warp, dome
 from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.paraboloid import invert
 from mushpipe.stages.surface_fit import SurfaceFit
+from mushpipe.stages.warm_up import example_frame
 from tests.stages.caps import CAMERA, Cap, cap, circles_of, draw, frame_from
 
 BED = 0.5
@@ -152,3 +155,21 @@ def test_the_inverse_is_numpys(seed: int, n: int) -> None:
     assert invert(own)
     np.testing.assert_allclose(own, np.linalg.inv(matrix), rtol=1e-7, atol=1e-9)
     assert not invert(np.zeros((n, n)))
+
+
+@pytest.mark.parametrize("seed", [428, 514, 515])
+def test_a_surface_whose_middle_is_far_from_all_its_points_is_none(seed: int) -> None:
+    """Waves, steps and holes; what is fitted to the rim of one may lie behind the camera."""
+    rng = np.random.default_rng(seed)
+    frame = example_frame()
+    height, width = frame.gray.shape
+    v, u = np.mgrid[:height, :width]
+    slopes, waves = rng.uniform(-8, 8, 2), rng.uniform(1, 9)
+    z = 400 + slopes[0] * u + slopes[1] * v + 40 * np.sin(u / waves) * rng.uniform(0, 3)
+    hole = rng.random(z.shape) < rng.uniform(0, 0.7)
+    depth = np.where(hole, 0, np.clip(z, 80, 4000)).astype(np.uint16)
+    circles = Circles(rng.uniform(0, [width, height], (30, 2)), rng.uniform(2, 80, 30), np.ones(30))
+    found = SurfaceFit().process(replace(frame, depth=depth), circles)
+    known = np.isfinite(found.position[:, 2])
+    assert (found.position[known, 2] > 0).all()
+    assert (found.source[~known] == DepthSource.MISSING).all()
