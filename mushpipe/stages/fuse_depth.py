@@ -13,6 +13,7 @@ from mushpipe import RgbdFrame, Stage
 from mushpipe.core.jit import jit
 
 Singles = NDArray[np.float32]
+SIGMAS = 4.0  # of depth noise, which the gate lets pass
 PAUSE_NS = 1_000_000_000  # what was seen longer ago is no part of what is seen now
 
 
@@ -20,15 +21,19 @@ class FuseDepth(Stage):
     """Averages depth over the last frames of a camera at rest, and fills holes from them.
 
     A pixel whose depth leaves its mean by more than the gate starts anew: it sees another surface
-    now. A pixel without depth keeps its mean until it has been without for `frames` frames.
-    Where more pixels start anew than noise explains, the camera moved, and the frame passes as it
-    is; so it does after a pause, and where stamps go back.
+    now. The gate widens with depth, as noise does. A pixel without depth keeps its mean until it
+    has been without for `frames` frames. Where more pixels start anew than noise explains, the
+    camera moved, and the frame passes as it is; so it does after a pause, and where stamps go back.
     """
 
     frames: int = Field(5, ge=1, le=100, description="frames that are averaged")
     gate_mm: float = Field(
-        4.0, gt=0, le=100, description="step of depth at which a pixel starts anew"
+        4.0, gt=0, le=100, description="least step of depth at which a pixel starts anew"
     )
+    depth_noise_mm: float = Field(
+        0.3, ge=0, description="sigma of depth at the camera, mm; the gate is never below four"
+    )
+    depth_noise_per_m: float = Field(1.2, ge=0, description="its growth with depth, mm per m")
     moved: float = Field(
         0.05,
         gt=0,
@@ -48,7 +53,7 @@ class FuseDepth(Stage):
             depth = np.ones((2, 2), dtype)
             depth.flags.writeable = False
             state = np.zeros((2, 2), np.float32), np.zeros((2, 2), np.uint8)
-            fuse(depth, *state, np.zeros((2, 2), np.uint8), 1.0, 2)
+            fuse(depth, *state, np.zeros((2, 2), np.uint8), (1.0, 0.0, 0.0), 2)
         self._mean = None
 
     def process(self, frame: RgbdFrame) -> RgbdFrame:
@@ -67,7 +72,9 @@ class FuseDepth(Stage):
         ):
             self._forget(frame)
         self._stamp_ns = frame.header.stamp_ns
-        gate = self.gate_mm / 1000 / frame.depth_scale
+        noise = SIGMAS * self.depth_noise_mm / 1000 / frame.depth_scale
+        growth = SIGMAS * self.depth_noise_per_m / 1000
+        gate = (self.gate_mm / 1000 / frame.depth_scale, noise, growth)
         fresh, known = fuse(depth, self._mean, self._count, self._age, gate, self.frames)
         if fresh > self.moved * known:
             self._forget(frame)
@@ -81,7 +88,10 @@ class FuseDepth(Stage):
 
 
 @jit
-def fuse(depth: NDArray[Any], mean: Any, count: Any, age: Any, gate: float, frames: int) -> Any:
+def fuse(
+    depth: NDArray[Any], mean: Any, count: Any, age: Any, gate: tuple[float, float, float],
+    frames: int,
+) -> Any:  # fmt: skip
     """Take one more depth image into a mean.
 
     Args:
@@ -89,7 +99,8 @@ def fuse(depth: NDArray[Any], mean: Any, count: Any, age: Any, gate: float, fram
         mean: (H, W) float32, in and out, 0 = missing.
         count: (H, W) uint8, in and out, how many frames each mean holds.
         age: (H, W) uint8, in and out, for how many frames each pixel had no depth.
-        gate: Step at which a pixel starts anew, native.
+        gate: Step at which a pixel starts anew, native: at least the first, and at least the second
+            plus the third times its depth.
         frames: Most frames that a mean holds.
 
     Returns:
@@ -108,7 +119,7 @@ def fuse(depth: NDArray[Any], mean: Any, count: Any, age: Any, gate: float, fram
             age[v, u] = 0
             step = z - mean[v, u]
             known += mean[v, u] > 0
-            if mean[v, u] > 0 and abs(step) <= gate:
+            if mean[v, u] > 0 and abs(step) <= max(gate[0], gate[1] + gate[2] * mean[v, u]):
                 count[v, u] = min(count[v, u] + 1, frames)
                 mean[v, u] += step / np.float32(count[v, u])
             else:

@@ -32,6 +32,17 @@ def test_noise_falls_by_the_root_of_the_number_of_frames() -> None:
     assert out.depth.mean() == pytest.approx(4000, abs=0.5)
 
 
+@pytest.mark.parametrize("z", [0.4, 0.95, 1.5, 3.0])
+def test_noise_as_it_is_at_a_distance_starts_no_pixel_anew(z: float) -> None:
+    rng, stage = np.random.default_rng(0), FuseDepth(frames=5)
+    stage.open()
+    noise = 0.0003 + 0.0012 * z
+    for _ in range(5):
+        out = stage.process(frame((z + rng.normal(0, noise, SHAPE)).astype(np.float32), 1.0))
+    assert out.depth is not None
+    assert out.depth.std() == pytest.approx(noise / np.sqrt(5), rel=0.06)
+
+
 def test_two_surfaces_are_never_mixed_and_edges_stay() -> None:
     stage = FuseDepth(frames=5)
     left, right = np.full(SHAPE, 500, np.uint16), np.full(SHAPE, 500, np.uint16)
