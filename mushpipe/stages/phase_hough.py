@@ -38,7 +38,7 @@ from mushpipe.stages.phase_polish import polish
 from mushpipe.stages.phase_refit import Table, refit
 from mushpipe.stages.phase_strips import Strips, in_strips
 from mushpipe.stages.phase_verifier import load_verifier
-from mushpipe.stages.phase_votes import CELL, peaks, rings_between, summed, vote
+from mushpipe.stages.phase_votes import CELL, centres
 from mushpipe.stages.verifier_net import Models
 from mushpipe.stages.warm_up import example_circles, example_frame
 
@@ -51,7 +51,6 @@ _STANDING = 0.004  # m; what is higher than this over the bed is looked at, in t
 EVIDENCE = 0.07  # share of an outline that votes; half-hidden caps show hardly more
 _BESIDE = 0.2  # the same beside a network: what has less it sees as well, and fewer cost less time
 _EVERY = 2  # edge points; of so many one votes where network and depth bring candidates as well
-_REACH = 2  # cells around a peak within which it must be the highest
 _SEEN = 0.1  # of `learned`; without depth, what the network sees less of is no cap
 _SURE = 0.8  # of a network's circle, from which on it is taken for a cap though it has no outline
 _LIKELY = 0.5  # score from which on a circle is more likely a cap than not
@@ -200,11 +199,9 @@ class PhaseHough(Stage):
         foreground = _foreground(inside, relief)
         region = np.ones_like(foreground) if literal else cv2.dilate(foreground, _AROUND)
         edges = self._edges(image, gradient, np.asarray(region, np.uint8), relief)
-        size = (-(-height // CELL), -(-width // CELL))
         every = 1 if learned is None or relief is None else _EVERY
-        cells = vote(edges, rings_between(smallest, largest), size, every)
         evidence = self.evidence or (EVIDENCE if learned is None else _BESIDE)
-        found = peaks(*summed(cells), evidence, smallest, largest, _REACH)
+        found = centres(edges, (smallest, largest), (height, width), evidence, every)
         known = None if learned is None else within(learned, smallest, largest)
         if known is not None:
             found = np.concatenate([found, candidates_of(known)])

@@ -26,6 +26,8 @@ from mushpipe.stages.phase_strips import Strips
 CELL = 2  # px; the accumulator has half the resolution of the image
 GAP = 0.15
 STEP = 2.0  # px between the radii of an edge point's votes
+WIDE = 20.0  # px; the votes that meet in 3 x 3 cells cancel where the phase turns in fewer
+REACH = 2  # cells around a peak within which it must be the highest
 
 
 class Rings(NamedTuple):
@@ -40,6 +42,35 @@ class Rings(NamedTuple):
     radius: Singles
     real: Singles
     imaginary: Singles
+
+
+def centres(
+    edges: Strips,
+    radii: tuple[float, float],
+    shape: tuple[int, int],
+    least: float,
+    every: int = 1,
+) -> Plane:
+    """Return likely circles (N, 4): x, y, radius in px, and the share of the outline that voted.
+
+    Args:
+        edges: What votes.
+        radii: Smallest and largest, px.
+        shape: Height and width of the image, px.
+        least: Smallest share.
+        every: Of so many edge points one votes.
+    """
+    coded = coded_range(*radii)
+    cells = vote(edges, rings_between(*coded), (-(-shape[0] // CELL), -(-shape[1] // CELL)), every)
+    found = peaks(*summed(cells), least, *coded, REACH)
+    near = (found[:, 2] > radii[0] - 2 * STEP) & (found[:, 2] < radii[1] + 2 * STEP)
+    return found if coded == radii else found[near]
+
+
+def coded_range(smallest: float, largest: float) -> tuple[float, float]:
+    """Return the radii between which the phase turns once: `WIDE` apart at least."""
+    low = max(smallest - max(0.0, WIDE - (largest - smallest)) / 2, smallest / 2)
+    return low, max(largest, low + WIDE)
 
 
 def rings_between(smallest: float, largest: float) -> Rings:

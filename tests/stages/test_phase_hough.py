@@ -35,6 +35,19 @@ def test_discs_are_found_once_each_and_to_a_fraction_of_a_pixel(source: str) -> 
     assert (circles.score > 0.5).all()
 
 
+@pytest.mark.parametrize("source", ["image", "mask"])
+@pytest.mark.parametrize("share", [0.02, 0.05, 0.2])
+@pytest.mark.parametrize("radius", [6.0, 9.0, 20.0, 45.0])
+def test_a_range_of_radii_may_be_as_narrow_as_one_likes(
+    radius: float, share: float, source: str
+) -> None:
+    """The votes of a few radii meet in the same cells, and must agree there."""
+    limits = (radius * (1 - share), radius * (1 + share))
+    circles = found(discs([(80.3, 60.6, radius)], 0.8, 0.15), input=source, radius_px=limits)
+    (row,) = as_rows(circles)
+    assert row == pytest.approx((80.3, 60.6, radius), abs=0.15 if source == "image" else 0.4)
+
+
 @settings(deadline=None, max_examples=12)
 @given(dx=st.floats(-0.5, 0.5), dy=st.floats(-0.5, 0.5), radius=st.floats(9, 30))
 def test_a_shift_by_fractions_of_a_pixel_moves_the_centre_by_it(
