@@ -176,7 +176,10 @@ def _values(sensor: Any) -> dict[str, float]:
 
 
 def camera_of(given: Any) -> Camera:
-    """Turn librealsense's intrinsics into a `Camera`.
+    """Turn librealsense's intrinsics of a colour stream into a `Camera`.
+
+    D400 cameras call their colour lens ``inverse_brown_conrady``, but librealsense (since 2.45)
+    and ROS take its coefficients on the way into the image, as a lens has them.
 
     Raises:
         DeviceError: The lens model is not one that `Camera` has.
@@ -186,6 +189,7 @@ def camera_of(given: Any) -> Camera:
         model = "none"
     if model not in ("none", "brown_conrady", "inverse_brown_conrady"):
         raise DeviceError(f"the colour camera's lens model '{model}' is not supported")
+    model = "brown_conrady" if model == "inverse_brown_conrady" else model
     return Camera(
         *(given.width, given.height, given.fx, given.fy, given.ppx, given.ppy),
         model,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from mushpipe.core.document import read_document
@@ -87,6 +88,18 @@ def test_lens_models(model, coefficients, expected):
     given.width, given.height, given.fx, given.fy = 640, 480, 600.0, 600.0
     given.model, given.coeffs = getattr(rs.distortion, model), list(coefficients)
     assert camera_of(given).model == expected
+
+
+@pytest.mark.parametrize("model", ["brown_conrady", "inverse_brown_conrady"])
+def test_rays_are_those_of_librealsense(model):
+    given = rs.intrinsics()  # of a D455, as its owner published it
+    given.width, given.height, given.fx, given.fy = 640, 480, 385.0, 384.4
+    given.ppx, given.ppy, given.model = 321.7, 238.9, getattr(rs.distortion, model)
+    given.coeffs = [-0.0565362684, 0.0682018697, 0.0003659752, 0.0006925757, -0.0218431670]
+    pixels = np.array([(x, y) for x in range(0, 640, 71) for y in range(0, 480, 53)], float)
+    rays = [rs.rs2_deproject_pixel_to_point(given, pixel, 1.0) for pixel in pixels.tolist()]
+    found = camera_of(given).deproject(pixels, np.ones(len(pixels)))
+    assert found == pytest.approx(np.array(rays), abs=5e-5)  # it iterates ten times
 
 
 @pytest.mark.parametrize("first", [0.1, 0.0])
