@@ -35,19 +35,23 @@ def read_manifest(path: Path) -> dict[str, Any]:
     Raises:
         InputError: What it says is no JSON object.
     """
-    return manifest_of(path, RecordingReader(path).index())
+    return stated(path, RecordingReader(path).index(), MANIFEST)
 
 
-def manifest_of(path: Path, index: Index) -> dict[str, Any]:
-    """Return that of a recording whose index was read; see `read_manifest`."""
-    stored = index.metadata.get(MANIFEST, {})
+def stated(path: Path, index: Index, name: str) -> dict[str, Any]:
+    """Return what a recording whose index was read says of itself under a name, or nothing.
+
+    Raises:
+        InputError: It is no JSON object.
+    """
+    stored = index.metadata.get(name, {})
     try:
-        manifest = json.loads(stored.get("json", "{}"))
+        content = json.loads(stored.get("json", "{}"))
     except ValueError:
-        manifest = None
-    if not isinstance(manifest, dict):
-        raise InputError(f"{path}: its metadata '{MANIFEST}' hold no JSON object")
-    return manifest
+        content = None
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: its metadata '{name}' hold no JSON object")
+    return content
 
 
 def stage_times(message: bytes) -> dict[str, int]:

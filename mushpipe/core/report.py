@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mushpipe.core.errors import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_OK, MushpipeError
+from mushpipe.core.types import Header
 
 
 class Durations:
@@ -67,6 +68,7 @@ class RunReport:
     ``durations`` holds what each node takes for a frame, source and sinks on threads of their own;
     ``frame`` the sum of the stages; ``latency`` the time from when a frame left the source until
     what was found in it is handed to the sinks. ``elapsed_s`` counts from when all is open.
+    ``span`` holds the first and last stamp and sequence number of the frames that went in;
     ``files`` are those that sinks write.
     """
 
@@ -76,6 +78,7 @@ class RunReport:
     processed: int = 0
     dropped: int = 0
     failed: int = 0
+    span: dict[str, tuple[int, int]] = field(default_factory=dict)
     source: dict[str, int] = field(default_factory=dict)
     device: dict[str, Any] = field(default_factory=dict)
     sinks: dict[str, SinkReport] = field(default_factory=dict)
@@ -92,6 +95,13 @@ class RunReport:
     def frames_in(self) -> int:
         """Frames that entered the pipeline."""
         return self.read - self.waiting
+
+    def widen_span(self, header: Header) -> None:
+        """Note that a frame went in, whatever becomes of it."""
+        for name in ("stamp_ns", "sequence"):
+            value = getattr(header, name)
+            low, high = self.span.get(name, (value, value))
+            self.span[name] = min(low, value), max(high, value)
 
     def balanced(self) -> bool:
         """Whether frames in = processed + dropped + failed, for the pipeline and every sink."""
@@ -119,6 +129,7 @@ class RunReport:
                 "failed": self.failed,
                 "balanced": self.balanced(),
             },
+            **({"span": self.span} if self.span else {}),
             "source": self.source,
             **({"device": self.device} if self.device else {}),
             "sinks": {name: vars(sink) for name, sink in self.sinks.items()},

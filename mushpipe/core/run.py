@@ -202,6 +202,7 @@ class _Runner:
             return
         for name, duration in passage.durations_ns.items():
             self.report.durations[name].add(duration)
+        self.report.widen_span(passage.frame.header)
         if passage.failed is not None:
             self._count_failure(passage.frame, *passage.failed)
         else:

@@ -136,6 +136,10 @@ def judge_results(
     _judge_frames(judged, rules)
     if not all(map(comparable, judged.verdicts)):
         judged.notes.append("truth and results are in different frames: 3D errors are unknown")
+    if results.failed:
+        judged.notes.append(f"{results.failed} frames failed when the graph ran")
+    if error := results.summary.get("error"):
+        judged.notes.append(f"the run ended early: {error}")
     unanswered = _unanswered(judged)
     if unanswered:
         judged.notes.append(f"{len(unanswered)} frames have no answer: all in them is missed")
@@ -181,13 +185,19 @@ def foreign_truth(results: Results, truth: TruthSet) -> str:
 def _unanswered(judged: Judged) -> list[Place]:
     """Return the frames with truth that were not answered and should have been."""
     answered = {verdict.place for verdict in judged.verdicts}
-    if not answered:
-        return []  # these results and this truth have nothing to do with each other
-    first, last = min(answered), max(answered)
+    results = judged.results
+    # without any answer, these results and this truth may have nothing to do with each other
+    whole = bool(answered) and not results.partial
+    spans = {"stamp_ns": results.span("stamp_ns"), "index": results.span("sequence")}
+
+    def looked_at(kind: str, value: int) -> bool:
+        low, high = spans[kind]
+        return low <= value <= high
+
     return [
         place
         for place in judged.truth.frames
-        if place not in answered and (first <= place <= last or not judged.results.partial)
+        if place not in answered and (whole or looked_at(*place))
     ]
 
 

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.errors import InputError, UsageError, suggest
-from mushpipe.core.recording import Index, Raw, RecordingReader
+from mushpipe.core.recording import MANIFEST, SUMMARY, Index, Raw, RecordingReader
 from mushpipe.core.tables import Circles, Columns, Floats, PickFlag, Picks, column
 from mushpipe.core.types import Header
 from mushpipe.core.wire import TIMING_TOPIC, TOTAL, decode_table
-from mushpipe.traces import manifest_of, stage_times
+from mushpipe.traces import stage_times, stated
 
 PICKS, CIRCLES = "mushpipe.Picks", "mushpipe.Circles"
 
@@ -80,6 +80,7 @@ class Results:
         frames: Per frame that was answered, in order.
         durations_ms: Per stage, the time it took on each frame.
         manifest: What the run was made of; empty where the file does not say.
+        summary: How the run went; empty where the file does not say.
         damage: What could not be read, in words.
     """
 
@@ -88,6 +89,7 @@ class Results:
     frames: list[tuple[Header, Detections]] = field(default_factory=list)
     durations_ms: dict[str, list[float]] = field(default_factory=dict)
     manifest: dict[str, Any] = field(default_factory=dict)
+    summary: dict[str, Any] = field(default_factory=dict)
     damage: list[str] = field(default_factory=list)
 
     @property
@@ -95,6 +97,20 @@ class Results:
         """Whether the run was asked to play only a part of its source."""
         source = self.manifest.get("graph", {}).get("source", {})
         return any(source.get(key) for key in ("max_frames", "max_seconds", "start", "end"))
+
+    @property
+    def failed(self) -> int:
+        """How many frames failed in the run, as far as the file says."""
+        return int(self.summary.get("frames", {}).get("failed", 0))
+
+    def span(self, name: str) -> tuple[int, int]:
+        """Return the lowest and highest ``stamp_ns`` or ``sequence`` that the run looked at.
+
+        Where the file does not say how the run went, those it answered stand for them.
+        """
+        answered = [getattr(header, name) for header, _ in self.frames]
+        seen = self.summary.get("span", {}).get(name, answered)
+        return min(seen), max(seen)
 
     @property
     def robot_frames(self) -> set[str]:
@@ -119,9 +135,9 @@ def read_results(path: Path, topic: str | None = None) -> Results:
     """
     reader = RecordingReader(path)
     index = reader.index()
-    manifest = manifest_of(path, index)
+    manifest, summary = stated(path, index, MANIFEST), stated(path, index, SUMMARY)
     topic = _choose(reader, index, topic)
-    results = Results(path, topic, manifest=manifest)
+    results = Results(path, topic, manifest=manifest, summary=summary)
     found: dict[tuple[int, int], tuple[Header, Detections]] = {}
     for raw in reader.messages({topic, TIMING_TOPIC}):
         if raw.channel.topic == TIMING_TOPIC:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from mushpipe import Camera, DepthSource, Header, PickFlag, Picks, RgbdFrame
 from mushpipe.core import wire
 from mushpipe.core.geometry import quaternion_from_axis
 from mushpipe.core.recorder import RecordingWriter
-from mushpipe.core.recording import MANIFEST
+from mushpipe.core.recording import MANIFEST, SUMMARY
 from mushpipe.core.truth import TRUTH_TOPIC, Truth
 
 CAMERA = Camera(640, 480, 600.0, 600.0, 319.5, 239.5)
@@ -96,6 +97,7 @@ def write_results(
     truths: Mapping[int, Truth] | None = None,
     manifest: str = "{}",
     milliseconds: float | None = None,
+    summary: Mapping[str, Any] | None = None,
 ) -> Path:
     """A result recording with its truth and without images."""
     writer = RecordingWriter(path, {MANIFEST: {"json": manifest}})
@@ -108,6 +110,8 @@ def write_results(
         if milliseconds is not None:
             content = {"stages_ns": {"pick": int(1e6 * milliseconds)}}
             writer.write(wire.TIMING_TOPIC, wire.json_message(wire.TIMING, at, content), at)
+    if summary is not None:
+        writer.metadata(SUMMARY, {"json": json.dumps(summary)})
     writer.close()
     return path
 

@@ -197,6 +197,44 @@ def test_a_frame_without_an_answer_is_missed(tmp_path: Path, truths: dict[int, A
     assert metrics(judged(partial))["recall"] == 1
 
 
+@pytest.mark.parametrize("failing", [[0], [2], [0, 2], [1]])
+def test_a_frame_that_failed_is_missed_wherever_it_stands_in_the_part_that_was_played(
+    graph: Path, tmp_path: Path, truths: dict[int, Any], failing: list[int]
+) -> None:
+    write_recording(tmp_path / "bed.mcap", {**truths, 3: bed(3)})
+    (tmp_path / "fussy.py").write_text(
+        "from mushpipe import Mask, RgbdFrame, Stage\n"
+        "class Fussy(Stage):\n"
+        "    def process(self, frame: RgbdFrame, mask: Mask) -> Mask:\n"
+        f"        if frame.header.sequence in {failing}:\n"
+        "            raise RuntimeError('I do not like it')\n"
+        "        return mask\n"
+    )
+    text = graph.read_text().replace("  detect:", "  fussy: {use: './fussy.py:Fussy'}\n  detect:")
+    graph.write_text(text + "on_error: skip\n")
+    out = tmp_path / "kept"
+    arguments = (graph, "--recordings", tmp_path / "bed.mcap", "--frames", 3, "--out", out)
+    content = judged(*arguments)
+    assert content["alternatives"][0]["overall"]["frames"] == 3  # the fourth was not asked for
+    assert metrics(content)["recall"] == pytest.approx(1 - len(failing) / 3, abs=0.02)
+    (recording,) = content["alternatives"][0]["recordings"]
+    failed = f"{len(failing)} frames failed when the graph ran"
+    assert failed in recording["notes"]
+    again = judged(out / "bed.mcap", "--truth", tmp_path / "bed.mcap")
+    assert metrics(again)["recall"] == metrics(content)["recall"]
+
+
+def test_a_recording_whose_only_label_is_of_a_frame_that_failed_counts(
+    tmp_path: Path, truths: dict[int, Any]
+) -> None:
+    whole = write_results(tmp_path / "a.mcap", {0: picks_of(truths[0])}, {0: truths[0]})
+    span = {"span": {"stamp_ns": [header(0).stamp_ns, header(1).stamp_ns], "sequence": [0, 1]}}
+    other = write_results(tmp_path / "b.mcap", {0: picks_of(truths[0])}, summary=span)
+    labels = write_recording(tmp_path / "truth.mcap", {1: truths[1]})
+    content = judged(whole, other, "--truth", tmp_path / "a.mcap", "--truth", labels)
+    assert metrics(content)["recall"] == 0.5
+
+
 def test_several_results_are_judged_each_and_together(
     tmp_path: Path, truths: dict[int, Any]
 ) -> None:
