@@ -27,7 +27,8 @@ def compare(
     a: Annotated[Path, typer.Argument(help="recording written by a sink mcap")],
     b: Annotated[Path, typer.Argument(help="another, to be the same")],
     tol: Annotated[
-        float, typer.Option(min=0, help="what numbers, and which share of pixels, may differ")
+        float,
+        typer.Option(min=0, help="what measured numbers, and which share of pixels, may differ"),
     ] = 0.0,
     topics: Annotated[str, typer.Option(help="compare only these, as '/mushpipe/*'")] = "*",
     long: Annotated[bool, typer.Option("--long", help="tell of every frame")] = False,

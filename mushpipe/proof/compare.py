@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from itertools import zip_longest
@@ -18,7 +19,10 @@ from mushpipe.core import wire
 from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.recording import Raw, RecordingReader
 
-Fields = Mapping[str, Any]
+Values = dict[tuple[int, ...], Any]
+"""The values on one path of a message, by their indices in the lists on the way."""
+Fields = dict[str, Any]
+"""By path: the pixels of an image, else `Values`."""
 _IMAGE, _COMPRESSED = "foxglove.RawImage", "foxglove.CompressedImage"
 _PIXELS = {"mono8": "u1", "rgb8": "u1", "mono16": "<u2", "16UC1": "<u2", "32FC1": "<f4"}
 
@@ -62,8 +66,9 @@ def compare(a: Path, b: Path, tolerance: float = 0.0, topics: str = "*") -> Comp
     Args:
         a: A recording.
         b: Another.
-        tolerance: Numbers x and y are the same where |x - y| <= tolerance (1 + |y|), images where
-            at most this share of their pixels differs. 0 is exact.
+        tolerance: Numbers x and y with a decimal point are the same where
+            |x - y| <= tolerance (1 + |y|), images where at most this share of their pixels
+            differs. 0 is exact, as are whole numbers, truth values and texts always.
         topics: Only topics that match, as in a shell.
 
     Raises:
@@ -111,30 +116,33 @@ def _keyed(reader: RecordingReader, topics: str) -> Iterator[tuple[Key, Raw]]:
 def _of_messages(key: Key, a: Raw, b: Raw, tolerance: float) -> Iterator[Difference]:
     if a.message.data == b.message.data and a.channel.metadata == b.channel.metadata:
         return
-    ours, theirs = _fields(a), _fields(b)
+    for name, text in _of_fields(_fields(a), _fields(b), tolerance):
+        yield Difference(key.topic, name, key.sequence, text)
+
+
+def _of_fields(ours: Fields, theirs: Fields, tolerance: float) -> Iterator[tuple[str, str]]:
     for name in ours | theirs:
         if name not in ours or name not in theirs:
             text: str | None = f"is only in the {'first' if name in ours else 'second'}"
         else:
             text = _difference(ours[name], theirs[name], tolerance)
         if text:
-            yield Difference(key.topic, name, key.sequence, text)
+            yield name, text
 
 
-def _fields(raw: Raw) -> dict[str, Any]:
-    """Return every value of a message: an array for an image, else a list for each path."""
+def _fields(raw: Raw) -> Fields:
     # such as the unit of a depth image
-    beside = {f"metadata.{name}": [text] for name, text in raw.channel.metadata.items()}
+    beside = {f"metadata.{name}": {(): text} for name, text in raw.channel.metadata.items()}
     return beside | _content(raw)
 
 
-def _content(raw: Raw) -> dict[str, Any]:
+def _content(raw: Raw) -> Fields:
     data = raw.message.data
     if raw.channel.message_encoding == "json":
         return _by_path(orjson.loads(data))
     message = _decoded(raw)
     if message is None:
-        return {"bytes": [data]}
+        return {"bytes": {(): data}}
     name = raw.schema.name if raw.schema else ""
     if name == _IMAGE and message.encoding in _PIXELS:
         pixels = np.frombuffer(message.data, _PIXELS[message.encoding])
@@ -150,10 +158,11 @@ def _content(raw: Raw) -> dict[str, Any]:
 
 def _image(
     values: np.ndarray[Any, Any], width: int, height: int, encoding: str, frame_id: str
-) -> dict[str, Any]:
+) -> Fields:
     area = width * height
     pixels = values.reshape(area, -1) if area and len(values) % area == 0 else values
-    return {"size": [width, height, encoding], "frame_id": [frame_id], "pixels": pixels}
+    beside = _by_path({"size": [width, height, encoding], "frame_id": frame_id})
+    return {**beside, "pixels": pixels}
 
 
 def _decompressed(data: bytes) -> np.ndarray[Any, Any] | None:
@@ -172,22 +181,21 @@ def _decoded(raw: Raw) -> Any:
     return decode(raw.message.data) if decode else None
 
 
-def _by_path(value: Any) -> dict[str, list[Any]]:
-    """Flatten nested JSON: all values on one path, whatever their index, form one list."""
-    found: dict[str, list[Any]] = {}
+def _by_path(value: Any) -> Fields:
+    """Return all values of nested JSON by path, and those of one path by their indices."""
+    found: dict[str, Values] = {}
 
-    def walk(item: Any, path: str) -> None:
-        if isinstance(item, dict):
+    def walk(item: Any, path: str, at: tuple[int, ...]) -> None:
+        if isinstance(item, dict) and item:
             for key, inner in item.items():
-                walk(inner, f"{path}.{key}" if path else key)
-        elif isinstance(item, list):
-            found.setdefault(path, [])
-            for inner in item:
-                walk(inner, path)
+                walk(inner, f"{path}.{key}" if path else key, at)
+        elif isinstance(item, list) and item:
+            for index, inner in enumerate(item):
+                walk(inner, path, (*at, index))
         else:
-            found.setdefault(path, []).append(item)
+            found.setdefault(path, {})[at] = item
 
-    walk(value, "")
+    walk(value, "", ())
     return found
 
 
@@ -200,28 +208,34 @@ def _difference(a: Any, b: Any, tolerance: float) -> str | None:
         apart = (a != b) & ~((a != a) & (b != b))
         different = int(np.count_nonzero(apart.reshape(len(a), -1).any(axis=1)))
         return f"{different} of {len(a)} pixels" if different > tolerance * len(a) else None
-    if len(a) != len(b):
-        return f"{len(a)} values against {len(b)}"
-    if a == b:
+    if a.keys() != b.keys():
+        number, other = _count(a), _count(b)
+        return f"{number} values against {other}" if number != other else "nested in another way"
+    apart = {at: _apart(a[at], b[at], tolerance) for at in a}
+    far = [at for at, distance in apart.items() if distance > 0]
+    if not far:
         return None
-    x, y = _numbers(a), _numbers(b)
-    if x is None or y is None:
-        return f"{_short(a)} against {_short(b)}"
-    far = ~np.isclose(x, y, rtol=tolerance, atol=tolerance, equal_nan=True)
-    if tolerance == 0:  # integers above 2^53 are no floats
-        far |= [
-            isinstance(p, int) and isinstance(q, int) and p != q for p, q in zip(a, b, strict=True)
-        ]
-    if not far.any():
-        return None
-    worst = int(np.argmax(np.where(far, np.nan_to_num(np.abs(x - y), nan=np.inf), -1)))
-    return f"{far.sum()} of {len(a)} values, at worst {a[worst]} against {b[worst]}"
+    worst = max(far, key=lambda at: apart[at])
+    place = "".join(f"[{index}]" for index in worst)
+    where = f"{len(far)} of {len(a)} values, at worst {place}: " if place else ""
+    return f"{where}{_short(a[worst])} against {_short(b[worst])}"
 
 
-def _numbers(values: list[Any]) -> np.ndarray[Any, np.dtype[np.float64]] | None:
-    if not all(value is None or isinstance(value, int | float) for value in values):
-        return None
-    return np.array([np.nan if value is None else value for value in values], float)
+def _count(values: Values) -> int:
+    return sum(value not in ([], {}) for value in values.values())
+
+
+def _apart(x: Any, y: Any, tolerance: float) -> float:
+    """Return how far two values are apart, 0 where they are the same.
+
+    The tolerance is for what was measured, and so has a decimal point: an id, a flag or a kind
+    that is nearly right is another one.
+    """
+    kinds = {type(x), type(y)}
+    if kinds in ({float}, {float, int}):
+        apart = abs(x - y)
+        return apart if apart > tolerance * (1 + abs(y)) else 0.0
+    return 0.0 if len(kinds) == 1 and x == y else math.inf
 
 
 def _short(value: Any) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 
 from mushpipe import InputError, Mask, Picks, Trace
 from mushpipe.core.errors import UsageError
-from mushpipe.proof.compare import _difference, compare
+from mushpipe.proof.compare import _by_path, _difference, _of_fields, compare
 from tests.core.lab import cli
 from tests.io.values import SIZE, make_frame, make_picks, record, trace_of
 
@@ -154,13 +155,53 @@ def test_the_verb_says_what_differs_and_exits_with_3(
     summary = capsys.readouterr().out.splitlines()
     assert summary == [
         "/mushpipe/pick  position: 1 frames differ, first frame 12: "
-        "1 of 6 values, at worst 0.1 against 0.35",
+        "1 of 6 values, at worst [0][0]: 0.1 against 0.35",
         "13 messages on 5 topics: 1 differences",
     ]
     assert cli(monkeypatch, "compare", base, path, "--long") == 3
     assert capsys.readouterr().out.startswith("frame    12  /mushpipe/pick  position: 1 of 6")
     assert cli(monkeypatch, "compare", base, path, "--tol", "0.5") == 0
     assert capsys.readouterr().out == "13 messages on 5 topics: the same\n"
+
+
+def test_the_tolerance_is_for_measured_numbers_not_for_ids_flags_and_kinds(
+    base: Path, tmp_path: Path
+) -> None:
+    picks = make_picks()
+    changed = replace(
+        picks, id=picks.id + 1, flags=picks.flags ^ np.uint32(8), score=picks.score - 0.01
+    )
+    found = compare(base, record(tmp_path / "c.mcap", traces(changed)), 0.5).differences
+    assert {d.field for d in found} == {"id", "flags"}
+
+
+@pytest.mark.parametrize(
+    ("a", "b"),
+    [
+        (True, False),
+        (True, 1),
+        (3, 4),
+        ("3", "4"),
+        (1.0, None),
+        (1.0, "1.0"),
+        ([[1.0, 2.0], [3.0]], [[1.0], [2.0, 3.0]]),
+        ([[], []], []),
+        ([[1.0], []], [[1.0]]),
+        ([{"a": 1.0}, {}], [{}, {"a": 1.0}]),
+        ({"a": {}}, {"a": []}),
+    ],
+)
+def test_other_values_kinds_and_nestings_differ_at_any_tolerance(a: Any, b: Any) -> None:
+    for one, other in ((a, b), (b, a)):
+        assert list(_of_fields(_by_path({"x": one}), _by_path({"x": other}), 1e9))
+    assert not list(_of_fields(_by_path({"x": a}), _by_path({"x": a}), 0.0))
+
+
+def test_a_difference_says_where_it_stands() -> None:
+    table = {"rows": [{"at": [0.0, 1.0]}, {"at": [2.0, 3.0]}]}
+    moved = {"rows": [{"at": [0.0, 1.5]}, {"at": [4.0, 3.0]}]}
+    (found,) = _of_fields(_by_path(table), _by_path(moved), 0.1)
+    assert found == ("rows.at", "2 of 4 values, at worst [1][0]: 2.0 against 4.0")
 
 
 def test_a_pixel_differs_however_many_of_its_channels_do() -> None:
@@ -175,8 +216,9 @@ def test_a_pixel_differs_however_many_of_its_channels_do() -> None:
 
 @pytest.mark.parametrize("number", [2**53, 1_700_000_000_000_000_001])
 def test_large_integers_are_compared_exactly(number: int) -> None:
-    assert _difference([number], [number], 0.0) is None
-    assert _difference([number], [number + 1], 0.0) is not None
+    same, other = ({"x": [each]} for each in (number, number + 1))
+    assert not list(_of_fields(_by_path(same), _by_path(same), 0.0))
+    assert list(_of_fields(_by_path(same), _by_path(other), 0.0))
 
 
 def test_compressed_images_are_compared_by_their_pixels(base: Path, tmp_path: Path) -> None:
