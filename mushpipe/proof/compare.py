@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from itertools import zip_longest
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,7 +59,13 @@ class Comparison:
     differences: list[Difference] = field(default_factory=list)
 
 
-def compare(a: Path, b: Path, tolerance: float = 0.0, topics: str = "*") -> Comparison:
+def compare(
+    a: Path,
+    b: Path,
+    tolerance: float = 0.0,
+    topics: str = "*",
+    limits: Mapping[str, float] = MappingProxyType({}),
+) -> Comparison:
     """Compare two recordings; the time the stages took and what is drawn of results are left out.
 
     Messages belong together by topic, sensor time and sequence, in whatever order they stand.
@@ -70,6 +77,7 @@ def compare(a: Path, b: Path, tolerance: float = 0.0, topics: str = "*") -> Comp
             |x - y| <= tolerance (1 + |y|), images where at most this share of their pixels
             differs. 0 is exact, as are whole numbers, truth values and texts always.
         topics: Only topics that match, as in a shell.
+        limits: By field, what its numbers may differ by, in their unit, in place of the tolerance.
 
     Raises:
         UsageError: There is no such file, or they hold nothing to compare.
@@ -90,7 +98,7 @@ def compare(a: Path, b: Path, tolerance: float = 0.0, topics: str = "*") -> Comp
             result.messages += 1
             result.topics.add(key.topic)
             ours, theirs = (raw, partner) if side == 0 else (partner, raw)
-            result.differences += _of_messages(key, ours, theirs, tolerance)
+            result.differences += _of_messages(key, ours, theirs, tolerance, limits)
     for reader, rest in zip(readers, waiting, strict=True):
         if reader.damage:
             raise InputError(f"{reader.path} is damaged: {'; '.join(reader.damage)}")
@@ -113,19 +121,26 @@ def _keyed(reader: RecordingReader, topics: str) -> Iterator[tuple[Key, Raw]]:
         seen[place] += 1
 
 
-def _of_messages(key: Key, a: Raw, b: Raw, tolerance: float) -> Iterator[Difference]:
+def _of_messages(
+    key: Key, a: Raw, b: Raw, tolerance: float, limits: Mapping[str, float]
+) -> Iterator[Difference]:
     if a.message.data == b.message.data and a.channel.metadata == b.channel.metadata:
         return
-    for name, text in _of_fields(_fields(a), _fields(b), tolerance):
+    for name, text in _of_fields(_fields(a), _fields(b), tolerance, limits):
         yield Difference(key.topic, name, key.sequence, text)
 
 
-def _of_fields(ours: Fields, theirs: Fields, tolerance: float) -> Iterator[tuple[str, str]]:
+def _of_fields(
+    ours: Fields,
+    theirs: Fields,
+    tolerance: float,
+    limits: Mapping[str, float] = MappingProxyType({}),
+) -> Iterator[tuple[str, str]]:
     for name in ours | theirs:
         if name not in ours or name not in theirs:
             text: str | None = f"is only in the {'first' if name in ours else 'second'}"
         else:
-            text = _difference(ours[name], theirs[name], tolerance)
+            text = _difference(ours[name], theirs[name], tolerance, limits.get(name))
         if text:
             yield name, text
 
@@ -199,7 +214,7 @@ def _by_path(value: Any) -> Fields:
     return found
 
 
-def _difference(a: Any, b: Any, tolerance: float) -> str | None:
+def _difference(a: Any, b: Any, tolerance: float, limit: float | None = None) -> str | None:
     """Say how two fields differ; None where they do not."""
     if isinstance(a, np.ndarray):
         if len(a) != len(b):
@@ -211,7 +226,7 @@ def _difference(a: Any, b: Any, tolerance: float) -> str | None:
     if a.keys() != b.keys():
         number, other = _count(a), _count(b)
         return f"{number} values against {other}" if number != other else "nested in another way"
-    apart = {at: _apart(a[at], b[at], tolerance) for at in a}
+    apart = {at: _apart(a[at], b[at], tolerance, limit) for at in a}
     far = [at for at, distance in apart.items() if distance > 0]
     if not far:
         return None
@@ -225,7 +240,7 @@ def _count(values: Values) -> int:
     return sum(value not in ([], {}) for value in values.values())
 
 
-def _apart(x: Any, y: Any, tolerance: float) -> float:
+def _apart(x: Any, y: Any, tolerance: float, limit: float | None) -> float:
     """Return how far two values are apart, 0 where they are the same.
 
     The tolerance is for what was measured, and so has a decimal point: an id, a flag or a kind
@@ -234,7 +249,8 @@ def _apart(x: Any, y: Any, tolerance: float) -> float:
     kinds = {type(x), type(y)}
     if kinds in ({float}, {float, int}):
         apart = abs(x - y)
-        return apart if apart > tolerance * (1 + abs(y)) else 0.0
+        allowed = tolerance * (1 + abs(y)) if limit is None else limit
+        return apart if apart > allowed else 0.0
     return 0.0 if len(kinds) == 1 and x == y else math.inf
 
 

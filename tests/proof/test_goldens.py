@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,19 @@ import pytest
 from mushpipe.core.document import read_document
 from mushpipe.core.graph import compile_document
 from mushpipe.core.plugins import load_registry
-from tests.proof.goldens import CASES, FOLDER, GRAPHS, RECORDINGS, ROOT, Case, renewed
+from mushpipe.proof.compare import compare
+from tests.evaluate.scenes import bed, picks_of, write_results
+from tests.proof.goldens import (
+    CASES,
+    FOLDER,
+    GRAPHS,
+    LIMITS,
+    RECORDINGS,
+    ROOT,
+    TOLERANCE,
+    Case,
+    renewed,
+)
 
 # Built-in plugins that no recording can show, each with the tests that stand in.
 ELSEWHERE = {
@@ -26,6 +39,31 @@ def test_a_recording_gives_what_it_gave(case: Case, tmp_path: Path) -> None:
     found = renewed(case, tmp_path / "new.mcap")
     assert found.differences == [], "see `make goldens`"
     assert found.messages >= 3 * case.frames
+
+
+@pytest.mark.parametrize(
+    ("name", "by", "differs"),
+    [
+        *((name, 5e-5, True) for name in ("position", "surface", "distance", "diameter")),
+        ("sigma_position", 5e-5, True),
+        ("diameter", 1e-6, False),
+        *((name, 2e-3, True) for name in ("center", "radius")),
+        ("center", 1e-4, False),
+        ("score", 5e-3, True),
+        ("score", 1e-4, False),
+    ],
+)
+def test_a_golden_is_held_to_less_than_a_robot_could_notice(
+    tmp_path: Path, name: str, by: float, differs: bool
+) -> None:
+    picks = picks_of(bed(0), sigma=0.01)
+    changed = replace(picks, **{name: getattr(picks, name) + by})
+    golden, new = (
+        write_results(tmp_path / f"{label}.mcap", {0: value})
+        for label, value in (("golden", picks), ("new", changed))
+    )
+    found = compare(golden, new, TOLERANCE, limits=LIMITS).differences
+    assert [d.field for d in found] == [name] * differs
 
 
 def test_every_recording_and_golden_has_its_counterpart() -> None:
