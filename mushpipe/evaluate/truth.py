@@ -61,9 +61,17 @@ class TruthSet:
         return any(kind == "index" for kind, _ in self.frames)
 
     def place(self, header: Header) -> Place | None:
-        """Return where the truth of a frame stands; None where it is not known."""
+        """Return where the truth of a frame stands; None where it is not known.
+
+        Raises:
+            InputError: It stands in two places.
+        """
         places: tuple[Place, Place] = ("stamp_ns", header.stamp_ns), ("index", header.sequence)
-        return next((place for place in places if place in self.frames), None)
+        known = [place for place in places if place in self.frames]
+        if len(known) > 1:
+            both = " and ".join(f"{kind}={value}" for kind, value in known)
+            raise InputError(f"{self.name}: {both} are the same frame; label it once")
+        return known[0] if known else None
 
 
 def read_truth(path: Path) -> TruthSet:

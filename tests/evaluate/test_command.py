@@ -186,6 +186,19 @@ def test_labels_judge_the_frames_they_name(tmp_path: Path, truths: dict[int, Any
     assert isinstance(run(results, "--truth", labels).exception, InputError)
 
 
+def test_a_frame_labelled_by_stamp_and_by_number_is_refused(
+    tmp_path: Path, truths: dict[int, Any]
+) -> None:
+    results = write_results(tmp_path / "r.mcap", {i: picks_of(t) for i, t in truths.items()})
+    stamp_ns = header(1).stamp_ns
+    frames = [{"stamp_ns": stamp_ns, "caps": []}, {"index": 1, "caps": []}]
+    labels = tmp_path / "labels.json"
+    labels.write_text(json.dumps({"mushpipe_labels": 1, "frames": frames}))
+    error = run(results, "--truth", labels).exception
+    assert isinstance(error, InputError)
+    assert f"labels.json: stamp_ns={stamp_ns} and index=1 are the same frame" in str(error)
+
+
 def test_a_frame_without_an_answer_is_missed(tmp_path: Path, truths: dict[int, Any]) -> None:
     answers = {i: picks_of(truths[i]) for i in (0, 1)}
     results = write_results(tmp_path / "r.mcap", answers, truths)
