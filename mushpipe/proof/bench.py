@@ -8,15 +8,20 @@ import platform
 import resource
 import time
 import tracemalloc
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
 from importlib.metadata import version
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from mushpipe.core.chain import Chain
 from mushpipe.core.errors import InputError, UsageError
+from mushpipe.core.manifest import build_manifest
 from mushpipe.core.plan import Plan
 from mushpipe.core.report import RunReport
 from mushpipe.core.run import Progress, run
+from mushpipe.core.stage import Source, Stage
 
 WARM_UP_FRAMES = 3
 TRACED_FRAMES = 5
@@ -31,31 +36,41 @@ def bench(plan_of: Callable[[int], Plan], frames: int) -> dict[str, Any]:
         frames: How many frames are measured.
 
     Returns:
-        Plain data; times in ms, memory in MB (1e6 bytes).
+        Plain data, `conditions` among it; times in ms, memory in MB (1e6 bytes).
 
     Raises:
         MushpipeError: The run failed, or had no frames.
     """
     _run(plan_of(WARM_UP_FRAMES))
-    allocated = _allocated_mb(plan_of(TRACED_FRAMES))
     watch = _Watch()
     report = _run(plan_of(frames), watch)
     cpu, elapsed = watch.cpu_s(), report.elapsed_s
-    summary = report.summary()
+    summary, peak = report.summary(), _peak_mb()
     return {
-        "graph": report.manifest["graph_file"],
-        "recordings": report.manifest["recordings"],
-        "machine": machine(),
+        **conditions(plan_of(frames)),
         "frames": report.processed,
         "frames_per_s": round(report.processed / elapsed, 2),
         "cpu_ms_per_frame": round(1e3 * cpu / report.processed, 2),
         "cores_busy": round(cpu / elapsed, 2),
-        "allocated_mb_per_frame": allocated,
-        "peak_memory_mb": round(_peak_mb(), 1),
+        "allocated_mb_per_frame": _allocated_mb(plan_of(TRACED_FRAMES)),
+        "peak_memory_mb": round(peak, 1),
         "memory_growth_mb": round(watch.growth_mb(), 2),
         "nodes": summary["durations"],
         "frame": summary["frame"],
         "latency": summary["latency"],
+    }
+
+
+def conditions(plan: Plan) -> dict[str, Any]:
+    """Describe what is measured, and where."""
+    manifest = build_manifest(plan)
+    settings = manifest["graph"]
+    settings["source"].pop("path", None)  # the same recording may lie elsewhere
+    return {
+        "graph": manifest["graph_file"],
+        "recordings": manifest["recordings"],
+        "settings": {name: settings[name] for name in ("source", "stages", "sinks")},
+        "machine": machine(),
     }
 
 
@@ -116,20 +131,27 @@ def _peak_mb() -> float:
 
 
 def _allocated_mb(plan: Plan) -> float:
-    """Return the median over frames of the memory that exists at once beyond what stays."""
+    """Return the median over frames of the memory that the stages need at once for one.
+
+    One frame after the other, on this thread: in a run it would depend on what else is on its way.
+    """
     peaks: list[float] = []
-
-    def note(report: RunReport) -> None:
-        del report
-        current, peak = tracemalloc.get_traced_memory()
-        peaks.append((peak - current) / 1e6)
-        tracemalloc.reset_peak()
-
-    tracemalloc.start()
-    try:
-        _run(plan, note)
-    finally:
-        tracemalloc.stop()
+    plan = plan.fresh()
+    chain, source = Chain(plan), plan.source.plugin
+    if not isinstance(source, Source):
+        raise TypeError("the plan's source is not a Source")
+    with ExitStack() as stack:
+        for plugin in (source, *(node.plugin for node in plan.stages)):
+            stack.callback(plugin.close)
+            if isinstance(plugin, Source | Stage):
+                plugin.open()
+        tracemalloc.start()
+        stack.callback(tracemalloc.stop)
+        for ticket, frame in enumerate(islice(source.frames(), TRACED_FRAMES)):
+            tracemalloc.reset_peak()
+            before, _ = tracemalloc.get_traced_memory()
+            chain.passed(frame, ticket)
+            peaks.append((tracemalloc.get_traced_memory()[1] - before) / 1e6)
     return round(sorted(peaks)[len(peaks) // 2], 2)
 
 
@@ -144,18 +166,54 @@ def slower(result: Mapping[str, Any], baseline: Mapping[str, Any]) -> dict[str, 
     }
 
 
-def read_baseline(path: Path, graph: Path) -> dict[str, Any]:
-    """Read figures of a graph that `mushpipe bench --json` wrote.
+def read_baseline(path: Path, now: Mapping[str, Any]) -> dict[str, Any]:
+    """Read figures that `mushpipe bench --json` wrote, to be compared with those to be measured.
+
+    Args:
+        path: The file.
+        now: The `conditions` of what is to be measured.
 
     Raises:
-        UsageError: The file cannot be read, or holds something else, or those of another graph.
+        UsageError: The file cannot be read, or holds something else, or figures that say nothing
+            of whether this became slower: of another graph, recording, pace or machine.
     """
     try:
         content: dict[str, Any] = json.loads(path.read_text())
         content["nodes"], content["frame"]["p50_ms"]
+        before, wanted = _identity(content), _identity(now)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UsageError(f"{path}: no figures of 'mushpipe bench --json': {error}") from error
-    measured = Path(content.get("graph", graph)).name
-    if measured != graph.name:
-        raise UsageError(f"{path}: the figures are those of {measured}, not of {graph.name}")
+    for name, value in wanted.items():
+        if before[name] != value:
+            raise UsageError(f"{path}: the figures are those of {before[name]}, not of {value}")
     return content
+
+
+def _identity(content: Mapping[str, Any]) -> dict[str, str]:
+    """Return, in words, what must be the same in figures that are compared."""
+    machine, settings = content["machine"], content["settings"]
+    files = [f"{each['file']} ({str(each['sha256'])[:12]})" for each in content["recordings"]]
+    return {
+        "graph": Path(content["graph"]).name,
+        "recordings": ", ".join(files) or f"the source '{settings['source']['use']}'",
+        "pace": f"speed {settings['source'].get('speed')}",
+        "machine": f"{machine['cores']} cores of {machine['processor']}",
+    }
+
+
+def changes(now: Mapping[str, Any], before: Mapping[str, Any]) -> list[str]:
+    """Say which settings and versions are not those of the baseline."""
+    sides = [dict(_flat({n: c[n] for n in ("settings", "machine")})) for c in (now, before)]
+    return [
+        f"{name} is {sides[0].get(name)}, in the baseline {sides[1].get(name)}"
+        for name in sorted(sides[0] | sides[1])
+        if sides[0].get(name) != sides[1].get(name)
+    ]
+
+
+def _flat(values: Mapping[str, Any], at: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{at}{name}.")
+        else:
+            yield f"{at}{name}", value

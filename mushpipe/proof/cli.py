@@ -94,6 +94,8 @@ def bench(
 
     What its sinks write goes to a temporary folder.
     """
+    import logging
+
     from mushpipe.console import set_up_logging
     from mushpipe.core.document import read_document
     from mushpipe.core.edges import files_read
@@ -102,13 +104,16 @@ def bench(
     from mushpipe.core.overwriting import require_writable, spare
     from mushpipe.core.plugins import load_registry
     from mushpipe.proof.bench import bench as measure
-    from mushpipe.proof.bench import read_baseline, slower
+    from mushpipe.proof.bench import changes, conditions, read_baseline, slower
 
     set_up_logging(False)
     require_writable(out)
-    before = read_baseline(baseline, graph) if baseline else None
     plan = compile_document(read_document(graph), load_registry(), set_ or [], recording)
     spare(out, *files_read(plan))
+    now = conditions(_endless(plan, frames, speed))
+    before = read_baseline(baseline, now) if baseline else None
+    for text in changes(now, before) if before else ():
+        logging.getLogger("mushpipe").warning(text)
     with TemporaryDirectory(prefix="mushpipe-bench-") as folder:
         plan = plan.into(Path(folder))  # results of a run stay as they are
         result = measure(lambda count: _endless(plan, count, speed), frames)

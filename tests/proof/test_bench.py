@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import threading
+import tracemalloc
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
 from mushpipe import Circles, RgbdFrame, Stage
 from mushpipe.core.errors import InputError, UsageError
-from mushpipe.proof.bench import bench, read_baseline, slower
+from mushpipe.proof.bench import _peak_mb, bench, changes, read_baseline, slower
 from tests.core.lab import Lab, circles, cli
 
 ROOT = Path(__file__).parents[2]
@@ -40,6 +43,40 @@ def test_figures_of_a_small_graph(lab: Lab) -> None:
     json.dumps(result)
 
 
+def test_a_frame_whose_memory_is_traced_is_alone(lab: Lab) -> None:
+    meeting, met = threading.Barrier(2), []
+
+    class Meets(Allocates):
+        reentrant: ClassVar[bool] = True
+
+        def process(self, frame: RgbdFrame) -> Circles:
+            with suppress(threading.BrokenBarrierError):
+                meeting.wait(0.05)
+                met.append(tracemalloc.is_tracing())
+            meeting.reset()
+            return super().process(frame)
+
+    text = lab.chain(Meets)
+    result = bench(lambda count: lab.compile(text, f"source.count={count}"), 10)
+    assert met
+    assert not any(met)
+    assert result["allocated_mb_per_frame"] == pytest.approx(8, abs=0.2)
+
+
+def test_the_peak_is_that_of_the_run_without_what_tracing_needs(lab: Lab) -> None:
+    before: list[float] = []
+
+    class Traced(Allocates):
+        def process(self, frame: RgbdFrame) -> Circles:
+            if tracemalloc.is_tracing():
+                before.append(_peak_mb())
+            return circles(1 + np.ones(10_000_000 if before else 1)[0])
+
+    text = lab.chain(Traced)
+    result = bench(lambda count: lab.compile(text, f"source.count={count}"), 10)
+    assert result["peak_memory_mb"] <= round(before[0], 1)
+
+
 def test_a_source_without_frames_has_no_figures(lab: Lab) -> None:
     with pytest.raises(InputError, match="no frame"):
         bench(lambda _: lab.compile(lab.chain("threshold"), "source.count=0"), 10)
@@ -60,7 +97,55 @@ def test_a_file_without_figures_is_no_baseline(tmp_path: Path, content: str) -> 
     path = tmp_path / "b.json"
     path.write_text(content)
     with pytest.raises(UsageError, match="no figures"):
-        read_baseline(path, Path("graph.yaml"))
+        read_baseline(path, measured())
+
+
+def measured(**other: Any) -> dict[str, Any]:
+    """Return conditions of figures, with other values in place of some."""
+    base = {
+        "graph": "a/pick.yaml",
+        "recordings": [{"file": "bed.mcap", "sha256": "123abc"}],
+        "settings": {"source": {"use": "mcap", "speed": 0.0}, "stages": {"a": {"use": "b"}}},
+        "machine": {"processor": "AMD", "cores": 2, "numpy": "2.4"},
+    }
+    return {**base, **other}
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        ({"graph": "b/pick.yaml"}, None),
+        ({"graph": "classic.yaml"}, r"those of classic\.yaml, not of pick\.yaml"),
+        ({"recordings": [{"file": "bed.mcap", "sha256": "99"}]}, r"bed\.mcap \(99\), not of bed"),
+        ({"recordings": []}, r"those of the source 'mcap', not of bed\.mcap"),
+        ({"settings": {"source": {"use": "mcap", "speed": 1.0}}}, r"speed 1\.0, not of speed 0"),
+        ({"machine": {"processor": "AMD", "cores": 4}}, "of 4 cores of AMD, not of 2 cores of AMD"),
+        ({"machine": {"processor": "Intel", "cores": 2}}, "2 cores of Intel, not of 2 cores of AM"),
+    ],
+)
+def test_figures_of_something_else_are_no_baseline(
+    tmp_path: Path, other: dict[str, Any], message: str | None
+) -> None:
+    path = tmp_path / "b.json"
+    path.write_text(json.dumps({**figures(a=1.0), **measured(**other)}))
+    if message is None:
+        assert read_baseline(path, measured())["graph"] == other["graph"]
+        return
+    with pytest.raises(UsageError, match=message):
+        read_baseline(path, measured())
+
+
+def test_settings_and_versions_that_changed_are_named() -> None:
+    before = measured(
+        settings={"source": {"use": "mcap", "speed": 0.0}, "stages": {"a": {"use": "c", "x": 1}}},
+        machine={"processor": "AMD", "cores": 2, "numpy": "2.3"},
+    )
+    assert changes(measured(), before) == [
+        "machine.numpy is 2.4, in the baseline 2.3",
+        "settings.stages.a.use is b, in the baseline c",
+        "settings.stages.a.x is None, in the baseline 1",
+    ]
+    assert changes(measured(), measured()) == []
 
 
 def test_the_verb_plays_a_short_recording_over_and_over(
@@ -72,11 +157,12 @@ def test_the_verb_plays_a_short_recording_over_and_over(
     assert cli(monkeypatch, *arguments, "--json", tmp_path / "b.json") == 0
     assert "frames: 10\n" in capsys.readouterr().out
     assert not (tmp_path / "log.mcap").exists()  # results of a run stay as they are
-    result = read_baseline(tmp_path / "b.json", Path("demo.yaml"))
-    with pytest.raises(UsageError, match=r"those of demo\.yaml, not of pick\.yaml"):
-        read_baseline(tmp_path / "b.json", Path("graphs/pick.yaml"))
+    result = json.loads((tmp_path / "b.json").read_text())
     for times in (*result["nodes"].values(), result["frame"]):
         times["p50_ms"] /= 1000
     (tmp_path / "faster.json").write_text(json.dumps(result))
     assert cli(monkeypatch, *arguments, "--baseline", tmp_path / "faster.json") == 3
     assert "x baseline" in capsys.readouterr().out
+    arguments[2] = ROOT / "recordings/gaps.mcap"
+    assert cli(monkeypatch, *arguments, "--baseline", tmp_path / "b.json") == 2
+    assert "those of sparse.mcap" in capsys.readouterr().err
