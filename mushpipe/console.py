@@ -138,6 +138,13 @@ def show_report(report: RunReport) -> None:
         f"{report.frames_in} frames in = {report.processed} processed + {report.dropped} dropped "
         f"+ {report.failed} failed, in {report.elapsed_s:.1f} s ({rate:.1f} frames/s)"
     )
+    if frames := (found := report.found).frames:
+        number = f"{found.rows} in {frames} frames, {found.rows / frames:.1f} a frame"
+        empty = f", none in {found.empty}" if found.empty else ""
+        stderr.print(
+            f"mushrooms: {number}{empty}" if found.rows else f"mushrooms: none in {frames} frames",
+            style=None if found.rows else "yellow",
+        )
     for name, count in report.source.items():
         stderr.print(f"{count} {name}", style="yellow")
     for name, sink in report.sinks.items():

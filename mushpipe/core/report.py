@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from mushpipe.core.errors import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_OK, MushpipeError
+from mushpipe.core.tables import Columns
 from mushpipe.core.types import Header
 
 
@@ -60,6 +62,23 @@ class SinkReport:
 
 
 @dataclass
+class Found:
+    """The rows of the last table that the stages made of each frame."""
+
+    rows: int = 0
+    frames: int = 0
+    empty: int = 0
+
+    def add(self, outputs: Mapping[str, tuple[Any, ...]]) -> None:
+        """Count what the stages, in order, made of a frame."""
+        values = (value for made in outputs.values() for value in made)
+        if tables := [value for value in values if isinstance(value, Columns)]:
+            self.rows += len(tables[-1])
+            self.frames += 1
+            self.empty += not len(tables[-1])
+
+
+@dataclass
 class RunReport:
     """The result of a run.
 
@@ -68,8 +87,8 @@ class RunReport:
     ``durations`` holds what each node takes for a frame, source and sinks on threads of their own;
     ``frame`` the sum of the stages; ``latency`` the time from when a frame left the source until
     what was found in it is handed to the sinks. ``elapsed_s`` counts from when all is open.
-    ``span`` holds the first and last stamp and sequence number of the frames that went in;
-    ``files`` are those that sinks write.
+    ``found`` counts the mushrooms; ``span`` holds the first and last stamp and sequence number of
+    the frames that went in; ``files`` are those that sinks write.
     """
 
     manifest: dict[str, Any] = field(default_factory=dict)
@@ -79,6 +98,7 @@ class RunReport:
     dropped: int = 0
     failed: int = 0
     span: dict[str, tuple[int, int]] = field(default_factory=dict)
+    found: Found = field(default_factory=Found)
     source: dict[str, int] = field(default_factory=dict)
     device: dict[str, Any] = field(default_factory=dict)
     sinks: dict[str, SinkReport] = field(default_factory=dict)
@@ -130,6 +150,7 @@ class RunReport:
                 "balanced": self.balanced(),
             },
             **({"span": self.span} if self.span else {}),
+            **({"found": vars(self.found)} if self.found.frames else {}),
             "source": self.source,
             **({"device": self.device} if self.device else {}),
             "sinks": {name: vars(sink) for name, sink in self.sinks.items()},

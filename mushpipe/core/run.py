@@ -208,6 +208,7 @@ class _Runner:
         else:
             self.failures_in_a_row = 0
             self.report.processed += 1
+            self.report.found.add(passage.outputs)
             if passage.durations_ns:  # a recorder has no stages whose time could be told
                 self.report.frame.add(sum(passage.durations_ns.values()))
             self.report.latency.add(time.perf_counter_ns() - left_ns)

@@ -75,6 +75,19 @@ def test_run_writes_results_and_manifest_and_prints_the_balance(folder: Path) ->
     }
 
 
+def test_run_says_how_many_mushrooms_it_found(folder: Path) -> None:
+    done = mushpipe("run", "graph.yaml", cwd=folder)
+    exported = mushpipe("export", "out.mcap", cwd=folder).stdout.splitlines()
+    number = sum(len(json.loads(line)["picks"]) for line in exported)
+    assert number > 10
+    assert f"mushrooms: {number} in 3 frames, {number / 3:.1f} a frame" in done.stderr
+    result = json.loads((folder / "out.run.json").read_text())["result"]
+    assert result["found"] == {"rows": number, "frames": 3, "empty": 0}
+    none = ("--set", "detect.radius_px=[200,210]")
+    done = mushpipe("run", "graph.yaml", *none, cwd=folder)
+    assert "mushrooms: none in 3 frames" in done.stderr
+
+
 def test_export_prints_one_json_line_per_frame(folder: Path) -> None:
     mushpipe("run", "graph.yaml", cwd=folder)
     done = mushpipe("export", "out.mcap", cwd=folder)
