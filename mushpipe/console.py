@@ -96,7 +96,7 @@ def execute(
         report = run(plan, stop, show, capsules)
     show_report(report)
     try:
-        if manifest is not None and report.exit_code != 2:  # a wrong command line is no run
+        if manifest is not None and report.opened:  # else it is still that of the run before
             spare(manifest, *report.files)
             manifest.parent.mkdir(parents=True, exist_ok=True)
             content = {**report.manifest, "result": report.summary()}

@@ -88,7 +88,8 @@ class RunReport:
     ``frame`` the sum of the stages; ``latency`` the time from when a frame left the source until
     what was found in it is handed to the sinks. ``elapsed_s`` counts from when all is open.
     ``found`` counts the mushrooms; ``span`` holds the first and last stamp and sequence number of
-    the frames that went in; ``files`` are those that sinks write.
+    the frames that went in; ``opened`` tells that source, stages and sinks were, so that what a run
+    before has left is no longer there; ``files`` are those that sinks write.
     """
 
     manifest: dict[str, Any] = field(default_factory=dict)
@@ -106,6 +107,7 @@ class RunReport:
     frame: Durations = field(default_factory=Durations)
     latency: Durations = field(default_factory=Durations)
     elapsed_s: float = 0.0
+    opened: bool = False
     files: tuple[Path, ...] = ()
     interrupted: bool = False
     error: MushpipeError | None = None

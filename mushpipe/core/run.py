@@ -104,6 +104,7 @@ class _Runner:
             for node in (*self.plan.stages, *sinks):
                 stack.enter_context(_opened(node, _opener(node, info)))
             self.report.files = tuple(path for paths in written.values() for path in paths)
+            self.report.opened = True
             self.started = time.monotonic()  # what opening took is no part of the frames' pace
             threads = [self._sink_thread(node) for node in self.plan.sinks]
             stack.enter_context(cores_shared())

@@ -88,6 +88,16 @@ def test_run_says_how_many_mushrooms_it_found(folder: Path) -> None:
     assert "mushrooms: none in 3 frames" in done.stderr
 
 
+def test_a_run_that_never_began_leaves_the_manifest_of_the_one_before(folder: Path) -> None:
+    mushpipe("run", "graph.yaml", cwd=folder)
+    before = (folder / "out.run.json").read_bytes()
+    (folder / "recordings").mkdir()
+    done = mushpipe("run", "graph.yaml", "--source", "recordings", cwd=folder)
+    assert done.returncode == EXIT_DAMAGED
+    assert (folder / "out.run.json").read_bytes() == before
+    assert "manifest:" not in done.stderr
+
+
 def test_export_prints_one_json_line_per_frame(folder: Path) -> None:
     mushpipe("run", "graph.yaml", cwd=folder)
     done = mushpipe("export", "out.mcap", cwd=folder)
