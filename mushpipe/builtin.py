@@ -7,6 +7,7 @@ from mushpipe.core.plugins import Registry, hookimpl
 def mushpipe_register(registry: Registry) -> None:
     """Register the built-in sources, stages and sinks."""
     registry.source("mcap", "mushpipe.sources.mcap:McapSource")
+    registry.source("images", "mushpipe.sources.folder:ImagesSource")
     registry.source("stream", "mushpipe.sources.stream:StreamSource")
     registry.source("realsense", "mushpipe.sources.realsense:RealsenseSource")
     registry.source("synthetic", "mushpipe.sources.synthetic:SyntheticSource")

@@ -138,6 +138,8 @@ def _replace_source(document: Document, source: str, registry: Registry) -> None
         given = {"use": source}
     elif source.endswith(".bag"):
         given = {"use": "realsense", "file": source}
+    elif Path(source).is_dir():
+        given = {"use": "images", "path": source}
     elif not (Path(source).exists() or Path(source).suffix):
         hint = suggest(source, registry.names("source"))
         document.warnings.append(f"'{source}' is neither a file nor a source; {hint}")

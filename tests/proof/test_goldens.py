@@ -30,6 +30,7 @@ ELSEWHERE = {
     "onnx": "tests/stages/test_onnx_model.py",  # the model is the user's own
     "foxglove": "tests/io/test_foxglove.py",  # it keeps nothing
     "stream": "tests/cli/test_stream.py",  # it reads a pipe
+    "images": "tests/io/test_image_files.py",  # it reads a folder
     "synthetic": "tests/sim",  # it is what the recordings were made with
 }
 

@@ -1,0 +1,186 @@
+"""Source `images`: plays a folder of image files."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections import Counter
+from collections.abc import Iterator
+from glob import escape
+from pathlib import Path
+from typing import Any, Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, PrivateAttr, field_validator, model_validator
+
+from mushpipe import Header, InputError, ReplaySource, RgbdFrame, UsageError
+from mushpipe.core.geometry import Camera
+from mushpipe.core.paths import GraphPath
+from mushpipe.sources.doubts import doubts
+from mushpipe.sources.mcap import NO_CAMERA
+from mushpipe.sources.playing import NO_DEPTH, Intrinsics
+
+logger = logging.getLogger("mushpipe")
+SUFFIXES = frozenset(["png", "jpg", "jpeg", "tif", "tiff", "bmp", "webp", "pgm", "ppm"])
+_TO_RGB = cv2.COLOR_BGR2RGB
+FRAME_ID = "camera_color_optical_frame"
+ALONE = "%s images without a %s image"
+
+
+class ImagesSource(ReplaySource):
+    """Plays image files in the order of their names, in which numbers count by their value.
+
+    A colour and a depth image belong together where `*` stands for the same in both names. Depth is
+    one channel of 16 bits or float32, aligned to colour; 0 is missing. Files do not say when they
+    were taken: the first frame has the stamp 0, and the others follow at `fps`.
+    """
+
+    path: GraphPath = Field(description="the folder")
+    color: str = Field(
+        "*", description="names of the colour images below the folder: rgb/*.png, or *_color.jpg"
+    )
+    depth: str | None = Field(None, description="names of the depth images: depth/*.png, say")
+    depth_scale: float | None = Field(
+        None, gt=0, description="metres per unit of depth: 0.001 where a unit is a millimetre"
+    )
+    camera: Intrinsics | None = Field(None, description="intrinsics of the colour images")
+    fps: float = Field(30, gt=0, le=1000, description="frames per second")
+
+    _counts: Counter[str] = PrivateAttr(default_factory=Counter)
+
+    @field_validator("color", "depth")
+    @classmethod
+    def _has_a_star(cls, value: str | None) -> str | None:
+        if value is not None and value.count("*") != 1:
+            raise ValueError("expected one `*` for what tells the images apart: depth/*.png")
+        return value
+
+    @model_validator(mode="after")
+    def _has_a_scale(self) -> Self:
+        if self.depth is not None and self.depth_scale is None:
+            raise ValueError("with depth, set depth_scale: how many metres a unit of it is")
+        return self
+
+    def name(self) -> str:
+        """Return the folder's name."""
+        return self.path.resolve().name
+
+    def files(self) -> tuple[Path, ...]:
+        """Return all images."""
+        found = (_named(self.path, names) for names in (self.color, self.depth) if names)
+        return tuple(path for images in found for path in images.values())
+
+    def open(self) -> None:
+        """Find the images.
+
+        Raises:
+            UsageError: There is no such folder.
+            InputError: It holds no such images, or none that belong together.
+        """
+        self._pairs()
+
+    def counts(self) -> dict[str, int]:
+        """Return how many images are without a partner."""
+        return dict(sorted(self._counts.items()))
+
+    def frames(self) -> Iterator[RgbdFrame]:
+        """Yield a frame per colour image.
+
+        Raises:
+            InputError: A file cannot be read, or is not what it should be.
+        """
+        if self.depth is None:
+            logger.warning(NO_DEPTH, self.name())
+        if self.camera is None:
+            logger.warning(NO_CAMERA, self.name(), "")
+        judged = False
+        for sequence, (color, depth) in enumerate(self._pairs()):
+            header = Header(round(sequence * 1e9 / self.fps), sequence, FRAME_ID)
+            frame = self._frame(header, color, depth)
+            if not judged and frame.depth is not None:
+                known = frame.depth_m[frame.depth_m > 0]
+                judged = len(known) > 0
+                for doubt in doubts(known):
+                    logger.warning("%s: %s", depth, doubt)
+            yield frame
+
+    def _pairs(self) -> list[tuple[Path, Path | None]]:
+        """Return each colour image with its depth image, and count those that are alone."""
+        if not self.path.is_dir():
+            raise UsageError(f"{self.path}: there is no such folder")
+        colors = _required(self.path, "color", self.color)
+        if self.depth is None:
+            return [(path, None) for path in colors.values()]
+        depths = _required(self.path, "depth", self.depth)
+        both = colors.keys() & depths.keys()
+        if not both:
+            raise InputError(
+                f"{self.path}: no depth image belongs to a colour image: `*` stands for "
+                f"'{next(iter(colors))}' in the first colour image, for '{next(iter(depths))}' in "
+                "the first depth image, and must be the same"
+            )
+        alone = {
+            ALONE % ("colour", "depth"): len(colors) - len(both),
+            ALONE % ("depth", "colour"): len(depths) - len(both),
+        }
+        self._counts = Counter({name: count for name, count in alone.items() if count})
+        return [(path, depths.get(key)) for key, path in colors.items()]
+
+    def _frame(self, header: Header, color: Path, depth: Path | None) -> RgbdFrame:
+        image = cv2.cvtColor(_read(color, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH), _TO_RGB)
+        values = None if depth is None else _read(depth, cv2.IMREAD_UNCHANGED)
+        pinhole = self.camera.model_dump() if self.camera else None
+        camera = None if pinhole is None else Camera(*image.shape[1::-1], **pinhole)
+        try:
+            return RgbdFrame(header, image, values, self.depth_scale or 0.001, camera)
+        except ValueError as error:
+            files = color if depth is None else f"{color} and {depth}"
+            raise InputError(f"{files}: {error}") from error
+
+
+def _required(folder: Path, setting: str, names: str) -> dict[str, Path]:
+    """Return the images of some names, in order, by what `*` stands for.
+
+    Raises:
+        InputError: There are none.
+    """
+    if found := _named(folder, names):
+        return found
+    files = [path for path in folder.glob("**/*") if path.is_file()]
+    images = [path for path in files if _is_image(path)]
+    kinds = Counter(str(path.relative_to(folder).with_stem("*")) for path in images or files)
+    hint = ", ".join(f"{each} ({count})" for each, count in kinds.most_common(8)) or "nothing"
+    hint = hint if images else f"no image, but {hint}"
+    raise InputError(f"{folder}: no image is named {names} (source.{setting}); there is {hint}")
+
+
+def _named(folder: Path, names: str) -> dict[str, Path]:
+    before, after = names.split("*")
+    paths = [p for p in folder.glob(f"{escape(before)}*{escape(after)}") if _is_image(p)]
+    keyed = {_key(path.relative_to(folder), before, after): path for path in paths}
+    return dict(sorted(keyed.items(), key=lambda item: _natural(item[0])))
+
+
+def _key(path: Path, before: str, after: str) -> str:
+    """Return what the star stands for, without the kind of file."""
+    text = str(path)[len(before) :].removesuffix(after)
+    return text if after else str(Path(text).with_suffix(""))
+
+
+def _natural(text: str) -> list[str | int]:
+    parts = re.split(r"([0-9]+)", text)
+    return [int(part) if k % 2 else part for k, part in enumerate(parts)]
+
+
+def _is_image(path: Path) -> bool:
+    return path.suffix[1:].lower() in SUFFIXES and path.is_file()
+
+
+def _read(path: Path, how: int) -> NDArray[Any]:
+    data = np.frombuffer(path.read_bytes(), np.uint8)
+    image = cv2.imdecode(data, how) if len(data) else None
+    if image is None:
+        raise InputError(f"{path}: it is no image, or damaged")
+    return np.asarray(image)
