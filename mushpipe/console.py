@@ -25,7 +25,8 @@ from mushpipe.core.plan import Plan
 from mushpipe.core.report import RunReport
 from mushpipe.core.run import run
 
-stderr = Console(stderr=True, highlight=False, soft_wrap=True)
+# Names may hold brackets, which are no markup.
+stderr = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
 
 
 def set_up_logging(verbose: bool) -> None:
@@ -104,7 +105,7 @@ def execute(
             stderr.print(f"manifest: {manifest}", style="dim")
     finally:  # a full disk takes no manifest either, and is not what went wrong first
         if report.error is not None:
-            stderr.print(f"error: {report.error}", style="bold red", markup=False)
+            stderr.print(f"error: {report.error}", style="bold red")
     return report
 
 

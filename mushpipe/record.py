@@ -116,7 +116,7 @@ def _show_files(plan: Plan, report: RunReport) -> None:
     from mushpipe.console import stderr
 
     for path in _files(plan):
-        stderr.print(f"{path}: {path.stat().st_size / 1e6:.1f} MB", markup=False)
+        stderr.print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
     if report.dropped:
         cure = "--colour jpeg or a faster disk would help"
         slow = f"{report.dropped} frames were lost because writing was too slow; {cure}"

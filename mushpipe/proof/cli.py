@@ -137,7 +137,7 @@ def _show(result: dict[str, Any], ratios: dict[str, float]) -> None:
 
     from mushpipe.console import durations_table
 
-    console = Console(file=sys.stdout, highlight=False, soft_wrap=True)
+    console = Console(file=sys.stdout, highlight=False, markup=False, soft_wrap=True)
     beside = {"all stages": result["frame"], "latency": result["latency"]}
     console.print(durations_table({**result["nodes"], **beside}, ratios))
     machine = result["machine"]

@@ -304,6 +304,19 @@ def test_a_graph_without_faults_may_name_files_of_another_machine(folder: Path) 
     assert "no file" not in mushpipe("validate", "graph.yaml", cwd=folder).stderr
 
 
+def test_names_with_brackets_are_printed_as_they_are(folder: Path) -> None:
+    (folder / "mine.py").write_text(
+        "from mushpipe import Mask, RgbdFrame, Stage\n\n"
+        "class Picky(Stage):\n"
+        "    def process(self, frame: RgbdFrame) -> Mask:\n"
+        "        raise RuntimeError('never')\n"
+    )
+    options = ["--set", "segment.use=./mine.py:Picky", "--manifest", "m[red].json"]
+    done = mushpipe("run", "graph.yaml", *options, "--capsules", "c[b]", cwd=folder)
+    assert "manifest: m[red].json\n" in done.stderr
+    assert "mushpipe run c[b]/" in done.stderr
+
+
 def test_the_results_of_a_failed_run_say_how_it_ended(folder: Path) -> None:
     (folder / "mine.py").write_text(
         "from mushpipe import Mask, RgbdFrame, Stage\n\n"
