@@ -8,12 +8,14 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import orjson
 from google.protobuf.message import DecodeError
 from mcap_protobuf.decoder import DecoderFactory
 
+from mushpipe.core.edges import limited
 from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.recording import MANIFEST, Index, Raw, RecordingReader
 from mushpipe.core.types import Header, Mask, RgbdFrame, Trace
@@ -92,11 +94,15 @@ def has_results(path: Path) -> bool:
     return any(t.startswith(RESULT_PREFIX) and t != TIMING_TOPIC for t in topics)
 
 
-def read_traces(path: Path) -> Iterator[Trace]:
+def read_traces(path: Path, played: Mapping[str, Any] = MappingProxyType({})) -> Iterator[Trace]:
     """Yield every frame of a recording with what the stages made of it, in order.
 
     The images are those in the file or else those of the recording it was made from. A recording
     without results yields its frames alone; so does a frame that no stage answered.
+
+    Args:
+        path: The recording.
+        played: Settings of the source `mcap` to play it with.
 
     Raises:
         UsageError: The images are not to be found.
@@ -119,7 +125,8 @@ def read_traces(path: Path) -> Iterator[Trace]:
     order = list(manifest.get("graph", {}).get("stages", {}))
     reader = RecordingReader(path)
     results = _Results(reader)
-    for frame in McapSource.model_validate(images).frames():
+    source = McapSource.model_validate({**images, **played})
+    for frame in limited(source.frames(), source):
         try:
             trace = _trace(frame, results.take(frame.header), order)
         except (ValueError, KeyError, TypeError, DecodeError) as error:

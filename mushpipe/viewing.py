@@ -6,7 +6,7 @@ import threading
 from enum import StrEnum
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -67,6 +67,12 @@ def view(
         int | None,
         typer.Option(metavar="PORT", min=1, max=65535, help="let viewers fetch it, until Ctrl-C"),
     ] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="A.B=VALUE", help="how it is played: source.color_topic=/camera/rgb"
+        ),
+    ] = None,
 ) -> None:
     """Open a recording or results in the Rerun viewer."""
     from pydantic import ValidationError
@@ -90,22 +96,39 @@ def view(
     except ValidationError as error:
         reason = error.errors()[0]["msg"].removeprefix("Value error, ")
         raise UsageError(f"--save {save}: {reason}") from error
+    played = _source_settings(file, set_ or [])
     stop = threading.Event()
     with interruptible(stop):
-        _play(file, sink, stop)
+        _play(file, played, sink, stop)
         if serve is not None:
             stop.wait()
         sink.close()
 
 
-def _play(file: Path, sink: RerunSink, stop: threading.Event) -> None:
+def _source_settings(file: Path, overrides: list[str]) -> dict[str, Any]:
+    """Return the settings of the source that the command line gives."""
+    from mushpipe.core.document import Document
+    from mushpipe.core.errors import UsageError
+    from mushpipe.core.graph import compile_document
+    from mushpipe.core.plugins import load_registry
+
+    source = {"use": "mcap", "path": str(file)}
+    document = Document("view", Path.cwd(), {"mushpipe": 1, "source": source})
+    node = compile_document(document, load_registry(), overrides).source
+    if node.use != "mcap":
+        raise UsageError(f"--set source.use={node.use}: view plays recordings, with 'mcap'")
+    given = node.plugin.model_fields_set - {"path"}
+    return {name: getattr(node.plugin, name) for name in given}
+
+
+def _play(file: Path, played: dict[str, Any], sink: RerunSink, stop: threading.Event) -> None:
     from mushpipe.console import progress_bar
     from mushpipe.core.errors import EXIT_INTERRUPTED
     from mushpipe.core.report import RunReport
     from mushpipe.core.stage import RunInfo
     from mushpipe.traces import read_manifest, read_traces
 
-    report, traces = RunReport(), read_traces(file)
+    report, traces = RunReport(), read_traces(file, played)
     first = next(traces, None)  # what has none fails here, before an .rrd is emptied for it
     sink.open(RunInfo(file.stem, read_manifest(file)))
     with progress_bar() as show:

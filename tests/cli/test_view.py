@@ -10,7 +10,8 @@ from typer.testing import CliRunner
 
 from mushpipe import Trace
 from mushpipe.cli import app
-from mushpipe.core.errors import DependencyError, InputError, UsageError
+from mushpipe.core.errors import DependencyError, GraphError, InputError, UsageError
+from tests.io.bags import COLOR, color_at, rgbd, write_bag
 from tests.io.values import make_circles, make_frame, make_picks, record, trace_of
 
 
@@ -57,6 +58,39 @@ def test_what_shows_nothing_leaves_an_earlier_file_alone(tmp_path: Path) -> None
     result = CliRunner().invoke(app, ["view", str(path), "--save", str(out)])
     assert isinstance(result.exception, InputError)
     assert out.read_text() == "an earlier one"
+
+
+def test_which_of_several_topics_is_shown_can_be_said(tmp_path: Path) -> None:
+    other = "/other/color/image_raw"
+    bag = write_bag(tmp_path, [*rgbd(range(2)), color_at(0, topic=other)])
+    arguments = ["view", str(bag), "--save", str(tmp_path / "bed.rrd")]
+    error = CliRunner().invoke(app, arguments).exception
+    assert isinstance(error, InputError)
+    assert f"--set source.color_topic={other}" in str(error)
+    chosen = [*arguments, "--set", f"source.color_topic={COLOR}"]
+    assert CliRunner().invoke(app, chosen).exit_code == 0
+    assert entities(tmp_path / "bed.rrd")["/camera/image/color"] == 2
+    assert CliRunner().invoke(app, [*chosen, "--set", "source.max_frames=1"]).exit_code == 0
+    assert entities(tmp_path / "bed.rrd")["/camera/image/color"] == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("source.colour_topic=/a", "did you mean 'color_topic'"),
+        ("source.speed=-1", "greater than or equal to 0"),
+        ("source.use=synthetic", "view plays recordings"),
+        ("log.path=x.mcap", "unknown path 'log.path'"),
+    ],
+)
+def test_a_wrong_setting_of_what_is_shown_is_told_of(
+    tmp_path: Path, change: str, message: str
+) -> None:
+    path = record(tmp_path / "a.mcap", [trace_of(make_frame())])
+    arguments = ["view", str(path), "--save", str(tmp_path / "a.rrd"), "--set", change]
+    error = CliRunner().invoke(app, arguments).exception
+    assert isinstance(error, UsageError | GraphError)
+    assert message in str(error)
 
 
 def test_without_a_display_it_says_what_to_do(
