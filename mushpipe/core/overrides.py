@@ -7,7 +7,8 @@ from typing import Any
 from mushpipe.core.document import Document, Location, parse_value
 from mushpipe.core.errors import GraphError, Problem, suggest
 
-_TOP = ("seed", "on_error", "max_failures", "source", "stages", "sinks")
+_WITH_PARTS = ("source", "stages", "sinks")
+_TOP = ("seed", "on_error", "max_failures", *_WITH_PARTS)
 
 
 def apply_override(document: Document, text: str, label: str = "") -> list[Problem]:
@@ -70,7 +71,9 @@ def _locate(document: Document, path: str) -> tuple[Location, str]:
             return (), "say which setting of the source: source.path=..., or use --source"
         return (head, *rest), ""
     if head not in sections:
-        return (), f"unknown path '{path}'; {suggest(head, [*sections, *_TOP])}"
+        known = suggest(head, [*sections, *(_WITH_PARTS if rest else _TOP)])
+        swap = "NAME.use=... gives a stage or sink of the graph another plugin; "
+        return (), f"unknown path '{path}'; {swap if rest == ['use'] else ''}{known}"
     if not rest:
         return (), f"say which setting of '{head}': {head}.use=... for example"
     return (sections[head], head, *rest), ""

@@ -67,6 +67,16 @@ def test_a_value_lands_where_the_path_says(text, at, value):
     [
         ("segment.level", "expected a.b=value"),
         ("segmnt.level=1", "unknown path 'segmnt.level'; did you mean 'segment'?"),
+        (
+            "seg.use=otsu",
+            "unknown path 'seg.use'; NAME.use=... gives a stage or sink of the graph another "
+            "plugin; did you mean 'segment'?",
+        ),
+        (
+            "sed.level=1",  # not 'seed', which has no parts
+            "unknown path 'sed.level'; known: out, segment, other, source, stages, sinks",
+        ),
+        ("sed=1", "unknown path 'sed'; did you mean 'seed'?"),
         ("sourc.count=1", "unknown path 'sourc.count'; did you mean 'source'?"),
         ("stages.segmet.level=1", "there is no 'segmet' in stages; did you mean 'segment'?"),
         ("sinks.segment.level=1", "there is no 'segment' in sinks; known: out"),
