@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import combinations
 from pathlib import Path
 
 from mushpipe.core.errors import EXIT_DAMAGED, EXIT_DIFFERS, EXIT_OK, InputError, UsageError
@@ -139,7 +140,7 @@ def perform(request: Request, folder: Path, runner: Runner) -> Judgement:
     graph = request.graph()
     code = EXIT_OK
     if graph is None:
-        evaluations = [_judge_files(request)]
+        evaluations = _judge_files(request)
     else:
         evaluations, code = _judge_graph(request, graph, folder, runner)
     sections = [_section(evaluation) for evaluation in evaluations]
@@ -153,14 +154,42 @@ def perform(request: Request, folder: Path, runner: Runner) -> Judgement:
     )
 
 
-def _judge_files(request: Request) -> Evaluation:
+def _judge_files(request: Request) -> list[Evaluation]:
     files = recordings_in(request.targets)
     truths = _given_truth(request, len(files))
-    evaluation = Evaluation(request.rules)
-    for file, truth, name in zip(files, truths, unique_names(files), strict=True):
-        evaluation.recordings.append(_judge(request, file, truth, None, name))
-    _require_judged(evaluation)
-    return evaluation
+    parts = [
+        _judge(request, file, truth, None, name)
+        for file, truth, name in zip(files, truths, unique_names(files), strict=True)
+    ]
+    if _same_frames(parts):
+        evaluations = [Evaluation(request.rules, [part], label=part.name) for part in parts]
+    else:
+        evaluations = [Evaluation(request.rules, parts)]
+    for evaluation in evaluations:
+        _require_judged(evaluation)
+    return evaluations
+
+
+def _same_frames(parts: Sequence[Judged]) -> bool:
+    """Return whether results answer the same frames of a recording, and so are alternatives.
+
+    Raises:
+        UsageError: Some do and others do not: together, the former would count twice.
+    """
+    frames = [{(*part.results.played, v.place) for v in part.verdicts} for part in parts]
+    pairs = [
+        (one, other)
+        for one, other in combinations(range(len(parts)), 2)
+        if parts[one].results.played and frames[one] & frames[other]
+    ]
+    if 0 < len(pairs) < len(parts) * (len(parts) - 1) // 2:
+        one, other = (parts[number] for number in pairs[0])
+        recordings = ", ".join(one.results.played.values())
+        raise UsageError(
+            f"{one.name} and {other.name} answer the same frames of {recordings}, others do not: "
+            "judge alternatives of one recording, or results of different ones"
+        )
+    return bool(pairs)
 
 
 def _given_truth(request: Request, files: int) -> Sequence[TruthSet | None]:

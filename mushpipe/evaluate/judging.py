@@ -173,8 +173,7 @@ def _judge_frames(judged: Judged, rules: Rules) -> None:
 
 def foreign_truth(results: Results, truth: TruthSet) -> str:
     """Say that the truth is carried by another recording than the one that was played."""
-    stated = results.manifest.get("recordings") or []
-    played = {entry["sha256"]: entry["file"] for entry in stated if entry.get("sha256")}
+    played = results.played
     if not played or truth.recording in (None, results.path):
         return ""
     if sha256(truth.recording) in played:

@@ -99,6 +99,12 @@ class Results:
         return any(source.get(key) for key in ("max_frames", "max_seconds", "start", "end"))
 
     @property
+    def played(self) -> dict[str, str]:
+        """The recordings that were played, by SHA-256; empty where the file does not say."""
+        stated = self.manifest.get("recordings") or []
+        return {entry["sha256"]: entry["file"] for entry in stated if entry.get("sha256")}
+
+    @property
     def failed(self) -> int:
         """How many frames failed in the run, as far as the file says."""
         return int(self.summary.get("frames", {}).get("failed", 0))

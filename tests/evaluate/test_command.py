@@ -260,6 +260,43 @@ def test_several_results_are_judged_each_and_together(
     assert only["overall"]["metrics"]["recall"]["value"] == 0.75
 
 
+def test_results_of_one_recording_are_compared_and_not_pooled(
+    tmp_path: Path, truths: dict[int, Any]
+) -> None:
+    manifest = manifest_of(write_recording(tmp_path / "bed.mcap", truths), "bed.mcap")
+    files = []
+    for name, kept in (("before", 20), ("after", 10)):
+        answers = {i: picks_of(t.take(slice(0, kept))) for i, t in truths.items()}
+        files.append(write_results(tmp_path / f"{name}.mcap", answers, truths, manifest))
+    content = judged(*files, "--threshold", "recall>=0.9")
+    assert [a["label"] for a in content["alternatives"]] == ["before", "after"]
+    assert [a["overall"]["frames"] for a in content["alternatives"]] == [3, 3]
+    (difference,) = content["differences"]
+    assert (difference["label"], difference["base"], difference["frames"]) == ("after", "before", 3)
+    assert difference["metrics"]["recall"]["value"] == pytest.approx(-0.5)
+    assert [t["kept"] for t in content["thresholds"]] == [True, False]
+    other = manifest_of(write_recording(tmp_path / "other.mcap", {0: bed(9)}), "other.mcap")
+    files.append(write_results(tmp_path / "c.mcap", {0: picks_of(bed(9))}, {0: bed(9)}, other))
+    error = run(*files).exception
+    assert isinstance(error, UsageError)
+    assert "before and after answer the same frames of bed.mcap" in str(error)
+
+
+def test_parts_of_one_recording_are_judged_together(tmp_path: Path, truths: dict[int, Any]) -> None:
+    manifest = json.loads(manifest_of(write_recording(tmp_path / "bed.mcap", truths), "bed.mcap"))
+    manifest["graph"]["source"]["max_frames"] = 2  # each is a part
+    parts = [
+        write_results(
+            tmp_path / f"{name}.mcap",
+            {i: picks_of(truths[i]) for i in numbers},
+            manifest=json.dumps(manifest),
+        )
+        for name, numbers in (("a", [0, 1]), ("b", [2]))
+    ]
+    (only,) = judged(*parts, "--truth", tmp_path / "bed.mcap")["alternatives"]
+    assert only["overall"]["frames"] == 3
+
+
 def test_damage_is_judged_as_far_as_it_goes(perfect: Path) -> None:
     perfect.write_bytes(perfect.read_bytes()[:-200])
     result = run(perfect)
