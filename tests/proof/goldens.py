@@ -25,8 +25,8 @@ from mushpipe.proof.compare import Comparison, compare
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "goldens"
-# Other processors round otherwise: masks in a few pixels, lengths by 1e-7 m and 1e-4 px, axes and
-# scores by 1e-5. This is well above that, and well below what a robot could notice.
+# Other processors round otherwise; seen so far: masks in a few pixels, lengths by 1e-7 m and
+# 1e-4 px, axes and scores by 1e-5. This is well above that, and well below what a robot notices.
 TOLERANCE = 1e-3
 METRES = ("position", "surface", "apex", "distance", "diameter", "sigma_position", "sigma_diameter")
 LIMITS = {**dict.fromkeys(METRES, 2e-5), **dict.fromkeys(("center", "radius"), 1e-3)}
