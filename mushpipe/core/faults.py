@@ -38,8 +38,9 @@ def faults_of(
             given = f", got {json.dumps(item['input'], default=str)}" if place else ""
             message = item["msg"].removeprefix("Value error, ")
             if not place:  # of all settings together, which the command line may have changed
-                labels = [text for key, text in document.overrides.items() if key[:-1] == at]
-                given = f" (with {', '.join(labels)})" if labels else ""
+                texts = (text for key, text in document.overrides.items() if key[:-1] == at)
+                labels = ", ".join(dict.fromkeys(texts))
+                given = f" (with {labels})" if labels else ""
             problems.append(document.problem(path, f"{what}: {message}{given}"))
     return problems
 

@@ -330,3 +330,11 @@ def test_the_results_of_a_failed_run_say_how_it_ended(folder: Path) -> None:
     summary = json.loads(metadata["mushpipe.summary"]["json"])
     assert summary["exit_code"] == EXIT_FAILED
     assert summary["frames"]["failed"] == 1
+
+
+def test_the_module_is_the_command() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "mushpipe", "plugins", "list"], capture_output=True, text=True
+    )
+    assert done.returncode == 0
+    assert "phase-hough" in done.stdout

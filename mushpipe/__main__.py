@@ -1,0 +1,5 @@
+"""`python -m mushpipe` is the command `mushpipe`."""
+
+from mushpipe.cli import main
+
+main()
