@@ -113,6 +113,14 @@ def test_any_name_will_do_where_there_is_colour_alone(tmp_path: Path) -> None:
     assert [int(frame.color.mean()) for frame in played(tmp_path)] == [1, 2]
 
 
+def test_a_folder_as_the_source_is_one_of_images(tmp_path: Path) -> None:
+    write(tmp_path / "0.png", 1)
+    document = read_document(ROOT / "graphs/pick.yaml")
+    plan = compile_document(document, load_registry(), [], str(tmp_path))
+    assert plan.source.use == "images"
+    assert plan.source.plugin.path == tmp_path
+
+
 @given(st.lists(st.tuples(st.text("ab0123456789", max_size=4), st.integers(0, 999)), unique=True))
 def test_numbers_in_names_count_by_their_value(names: list[tuple[str, int]]) -> None:
     """Whatever stands around them."""
