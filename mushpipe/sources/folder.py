@@ -158,8 +158,12 @@ def _required(folder: Path, setting: str, names: str) -> dict[str, Path]:
 
 def _named(folder: Path, names: str) -> dict[str, Path]:
     before, after = names.split("*")
-    paths = [p for p in folder.glob(f"{escape(before)}*{escape(after)}") if _is_image(p)]
-    keyed = {_key(path.relative_to(folder), before, after): path for path in paths}
+    keyed: dict[str, Path] = {}
+    for path in filter(_is_image, folder.glob(f"{escape(before)}*{escape(after)}")):
+        other = keyed.setdefault(_key(path.relative_to(folder), before, after), path)
+        if other != path:
+            both = " and ".join(sorted({path.name, other.name}))
+            raise InputError(f"{folder}: {both} are one image to '{names}': name one kind, *.png")
     return dict(sorted(keyed.items(), key=lambda item: _natural(item[0])))
 
 

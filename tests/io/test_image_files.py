@@ -152,6 +152,9 @@ def test_what_is_not_there_is_told_with_what_is(
         source(tmp_path, **settings)
     with pytest.raises(UsageError, match="there is no such folder"):
         source(tmp_path / "nowhere")
+    write(tmp_path / "c0.jpg", 1)
+    with pytest.raises(InputError, match=r"c0\.jpg and c0\.png are one image to '\*'"):
+        source(tmp_path)
 
 
 @pytest.mark.parametrize(
