@@ -11,14 +11,14 @@ from pathlib import Path
 from pydantic import Field, PrivateAttr
 
 from mushpipe.core import wire
-from mushpipe.core.errors import InputError
+from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.geometry import Camera
 from mushpipe.core.paths import GraphPath
 from mushpipe.core.recording import GRAPH, MANIFEST, Index, RecordingReader
 from mushpipe.core.stage import ReplaySource
 from mushpipe.core.types import RgbdFrame
 from mushpipe.sources.playing import NO_DEPTH, Player, RecordedSource
-from mushpipe.sources.topics import choose_topics
+from mushpipe.sources.topics import Topics, choose_topics
 
 logger = logging.getLogger("mushpipe")
 NO_CAMERA = "%s has no calibration%s: nothing can be measured in metres"
@@ -37,6 +37,7 @@ class McapSource(RecordedSource, ReplaySource):
     loop: int = Field(1, ge=0, description="how many times to play it; 0 is for ever")
 
     _counts: Counter[str] = PrivateAttr(default_factory=Counter)
+    _reader: RecordingReader | None = PrivateAttr(None)
 
     def name(self) -> str:
         """Return the recording's file name without its suffix."""
@@ -47,13 +48,31 @@ class McapSource(RecordedSource, ReplaySource):
         return (self.path,)
 
     def open(self) -> None:
-        """Check that the file is there and is MCAP.
+        """Check that there is something to play, as far as its index tells.
 
         Raises:
-            UsageError: There is no such file.
-            InputError: It is empty or not MCAP.
+            UsageError: There is no such file, or nothing lies between `start` and `end`.
+            InputError: It is empty, not MCAP, or without the topics that are asked for.
         """
-        RecordingReader(self.path)
+        self._reader = RecordingReader(self.path)
+        index, _ = self._chosen(self._reader)
+        length = (index.end_ns - index.start_ns) / 1e9
+        if self.end is not None and self.end <= self.start:
+            raise UsageError(f"{self.path}: end, {self.end:g} s, is not after start")
+        if self.start > length:
+            raise UsageError(
+                f"{self.path}: it ends after {length:.3f} s, before start, {self.start:g} s"
+            )
+
+    def _chosen(self, reader: RecordingReader) -> tuple[Index, Topics]:
+        """Return what a recording holds, and which of it is played; raises as `open` does."""
+        index = reader.index()
+        if not index.counts and reader.damage:
+            raise InputError(f"{self.path}: {'; '.join(reader.damage)}; nothing could be read")
+        topics = choose_topics(
+            index, self.path, self.color_topic, self.depth_topic, self.camera_topic
+        )
+        return index, topics if self.use_depth else replace(topics, depth=None)
 
     def counts(self) -> dict[str, int]:
         """Return how many images found no partner or could not be decoded."""
@@ -66,17 +85,10 @@ class McapSource(RecordedSource, ReplaySource):
             InputError: Not a recording, no colour images or no frame in the range; depth or
                 calibration do not fit the images; or, after the last good frame, damage.
         """
-        reader = RecordingReader(self.path)
-        index = reader.index()
-        if not index.counts and reader.damage:
-            raise InputError(f"{self.path}: {'; '.join(reader.damage)}; nothing could be read")
-        topics = choose_topics(
-            index, self.path, self.color_topic, self.depth_topic, self.camera_topic
-        )
+        reader = self._reader or RecordingReader(self.path)
+        index, topics = self._chosen(reader)
         numbered = MANIFEST in index.metadata or GRAPH in index.metadata
         beside = _beside(index) if numbered else set()
-        if not self.use_depth:
-            topics = replace(topics, depth=None)
         if topics.depth is None:
             logger.warning(NO_DEPTH, self.path.name)
         player = Player(self, str(self.path), topics, beside, numbered, self._counts)

@@ -104,6 +104,26 @@ def test_a_sink_of_ones_own_is_kept_from_its_source_by_the_type_of_its_path(fold
     assert (folder / "a.mcap").read_bytes() == before
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--start", 60), "a.mcap: it ends after 0.000 s, before start, 60 s"),
+        (("--start", 2, "--end", 1), "a.mcap: end, 1 s, is not after start"),
+        (("--set", "source.color_topic=/camera/colour"), "there is no topic '/camera/colour'; did"),
+    ],
+)
+def test_nothing_is_emptied_where_there_is_nothing_to_play(
+    folder: Path, options: tuple[object, ...], message: str
+) -> None:
+    mushpipe("record", "--source", "synthetic", "--frames", 1, "-o", "a.mcap", cwd=folder)
+    (folder / "out").mkdir()
+    (folder / "out/a.mcap").write_bytes(b"of a run before")
+    done = mushpipe("run", "graph.yaml", "--source", "a.mcap", *options, cwd=folder)
+    assert done.returncode != 0
+    assert message in done.stderr
+    assert (folder / "out/a.mcap").read_bytes() == b"of a run before"
+
+
 @pytest.mark.parametrize("held", ["out.mcap", "out.rrd"])
 def test_nothing_is_emptied_where_another_run_writes_one_of_the_files(
     folder: Path, held: str
