@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from functools import partial
 from io import FileIO
 from pathlib import Path
-from types import SimpleNamespace
+from types import EllipsisType, SimpleNamespace
 from typing import IO, Any, Literal, cast
 
 import mcap.writer
@@ -65,7 +65,7 @@ class RecordingWriter:
         self._writer.start(profile="mushpipe", library="mushpipe")
         self._schemas: dict[tuple[str, str], int] = {}
         self._channels: dict[tuple[str, str, tuple[tuple[str, str], ...]], int] = {}
-        self._camera: Camera | None = None
+        self._camera: Camera | EllipsisType | None = ...  # nothing was stated yet
         for name, values in metadata.items():
             self.metadata(name, values)
 
@@ -79,14 +79,15 @@ class RecordingWriter:
         self._writer.add_metadata(name, dict(values))
 
     def frame(self, frame: RgbdFrame, jpeg_quality: int | None = None) -> None:
-        """Write the calibration whenever it changes, what is attached, colour, and any depth.
+        """Write the calibration, or that there is none, where it changes; what is attached; images.
 
         The images come last: who reads a stream has all of a frame when it has its images.
         """
         header = frame.header
-        if frame.camera is not None and frame.camera != self._camera:
+        if frame.camera != self._camera:
             self._camera = frame.camera
-            self.write(wire.CAMERA_TOPIC, wire.encode_camera(frame.camera, header), header)
+            message = wire.encode_camera(frame.camera, frame.color.shape, header)
+            self.write(wire.CAMERA_TOPIC, message, header)
         for topic, value in frame.attached.items():
             self.value(topic, value, header)
         self.write(wire.COLOR_TOPIC, wire.encode_color(frame, jpeg_quality), header)

@@ -141,20 +141,31 @@ def encode_depth(frame: RgbdFrame) -> Message:
     return Message("", foxglove_schema("RawImage"), data, metadata)
 
 
-def encode_camera(camera: Camera, header: Header) -> Message:
-    """Encode the intrinsics as foxglove.CameraCalibration."""
+def encode_camera(camera: Camera | None, size: tuple[int, ...], header: Header) -> Message:
+    """Encode the intrinsics as foxglove.CameraCalibration.
+
+    Without any the matrices are zero, as in ROS, and so read as none again.
+
+    Args:
+        camera: The intrinsics.
+        size: Height and width of the image, px.
+        header: Of the frame.
+    """
     from foxglove.messages import CameraCalibration
 
-    k = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0]
+    k, one = [0.0] * 9, 0.0
+    if camera is not None:
+        one = 1.0
+        k = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, one]
     message = CameraCalibration(
         timestamp=timestamp(header.stamp_ns),
         frame_id=header.frame_id,
-        width=camera.width,
-        height=camera.height,
-        distortion_model=DISTORTION_MODELS[camera.model],
-        D=list(camera.coefficients),
+        width=size[1],
+        height=size[0],
+        distortion_model=DISTORTION_MODELS[camera.model] if camera else "",
+        D=list(camera.coefficients) if camera else [],
         K=k,
-        R=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        R=[one, 0.0, 0.0, 0.0, one, 0.0, 0.0, 0.0, one],
         P=[*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0],
     )
     return Message("", foxglove_schema("CameraCalibration"), message.encode())

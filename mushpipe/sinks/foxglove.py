@@ -64,7 +64,8 @@ class FoxgloveSink(Sink):
         if frame.depth is not None:
             self._send(trace, (wire.DEPTH_TOPIC, wire.encode_depth(frame)))
         if frame.camera is not None:
-            self._send(trace, (wire.CAMERA_TOPIC, wire.encode_camera(frame.camera, frame.header)))
+            message = wire.encode_camera(frame.camera, frame.color.shape, frame.header)
+            self._send(trace, (wire.CAMERA_TOPIC, message))
         for published in result_messages(trace, self._unknown, drawn=True):
             self._send(trace, published)
         if self._base is not None:

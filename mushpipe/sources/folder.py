@@ -20,7 +20,8 @@ from mushpipe.core.geometry import Camera
 from mushpipe.core.paths import GraphPath
 from mushpipe.sources.doubts import doubts
 from mushpipe.sources.mcap import NO_CAMERA
-from mushpipe.sources.playing import NO_DEPTH, Intrinsics
+from mushpipe.sources.playing import NO_DEPTH
+from mushpipe.sources.recorded import Intrinsics
 
 logger = logging.getLogger("mushpipe")
 SUFFIXES = frozenset(["png", "jpg", "jpeg", "tif", "tiff", "bmp", "webp", "pgm", "ppm"])

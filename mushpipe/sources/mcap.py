@@ -17,7 +17,8 @@ from mushpipe.core.paths import GraphPath
 from mushpipe.core.recording import GRAPH, MANIFEST, Index, RecordingReader
 from mushpipe.core.stage import ReplaySource
 from mushpipe.core.types import RgbdFrame
-from mushpipe.sources.playing import NO_DEPTH, Player, RecordedSource
+from mushpipe.sources.playing import NO_DEPTH, Player
+from mushpipe.sources.recorded import RecordedSource
 from mushpipe.sources.topics import Topics, choose_topics
 
 logger = logging.getLogger("mushpipe")

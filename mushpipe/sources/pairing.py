@@ -13,9 +13,9 @@ D = TypeVar("D")
 class Pairing(Generic[C, D]):
     """Pairs two streams of stamped items within a tolerance; every colour item comes out once.
 
-    Stamps rise within each stream, or go back where a clock was set. A colour item waits until its
-    depth item came, later items show that none will, or `PATIENCE` further items of a kind have
-    arrived.
+    Where items are numbered only those of one number belong together. Stamps rise within each
+    stream or stand still, or go back where a clock was set. A colour item waits until its depth
+    item came, later items show that none will, or `PATIENCE` further items of a kind have arrived.
     """
 
     PATIENCE = 32
@@ -24,10 +24,10 @@ class Pairing(Generic[C, D]):
         self.tolerance_ns = tolerance_ns
         self.color_alone = self.depth_alone = 0
         self._last_color = self._last_depth = 0
-        self._colors: deque[tuple[int, C]] = deque()
-        self._depths: deque[tuple[int, D]] = deque()
+        self._colors: deque[tuple[int, int, C]] = deque()
+        self._depths: deque[tuple[int, int, D]] = deque()
 
-    def add_color(self, stamp_ns: int, item: C) -> Iterator[tuple[C, D | None]]:
+    def add_color(self, stamp_ns: int, item: C, number: int = 0) -> Iterator[tuple[C, D | None]]:
         """Add a colour item; yield what is settled by it.
 
         Where stamps go back, nothing that came before can belong to what follows.
@@ -36,15 +36,15 @@ class Pairing(Generic[C, D]):
             yield from self._settle(last=True)
             self._forget(stamp_ns + self.tolerance_ns)
         self._last_color = stamp_ns
-        self._colors.append((stamp_ns, item))
+        self._colors.append((stamp_ns, number, item))
         yield from self._settle(last=False)
 
-    def add_depth(self, stamp_ns: int, item: D) -> Iterator[tuple[C, D | None]]:
+    def add_depth(self, stamp_ns: int, item: D, number: int = 0) -> Iterator[tuple[C, D | None]]:
         """Add a depth item; yield what is settled by it."""
         if stamp_ns < self._last_depth - self.tolerance_ns and not self._colors:
             self._forget(stamp_ns)
         self._last_depth = stamp_ns
-        self._depths.append((stamp_ns, item))
+        self._depths.append((stamp_ns, number, item))
         if not self._colors and len(self._depths) > self.PATIENCE:
             self._depths.popleft()
             self.depth_alone += 1
@@ -64,11 +64,13 @@ class Pairing(Generic[C, D]):
 
     def _settle(self, last: bool) -> Iterator[tuple[C, D | None]]:
         while self._colors:
-            stamp, color = self._colors[0]
+            stamp, number, color = self._colors[0]
             while self._depths and self._depths[0][0] < stamp - self.tolerance_ns:
                 self._depths.popleft()
                 self.depth_alone += 1
-            near = [d for d in self._depths if abs(d[0] - stamp) <= self.tolerance_ns]
+            near = [
+                d for d in self._depths if d[1] == number and abs(d[0] - stamp) <= self.tolerance_ns
+            ]
             if not (last or self._impatient() or self._is_final(stamp, near)):
                 return
             best = self._nearest(stamp, near)
@@ -80,9 +82,9 @@ class Pairing(Generic[C, D]):
             while self._depths[0] is not best:
                 self._depths.popleft()
                 self.depth_alone += 1
-            yield color, self._depths.popleft()[1]
+            yield color, self._depths.popleft()[2]
 
-    def _is_final(self, stamp: int, near: list[tuple[int, D]]) -> bool:
+    def _is_final(self, stamp: int, near: list[tuple[int, int, D]]) -> bool:
         """Whether nothing that is still to come can change the partner of the first colour."""
         if any(d[0] == stamp for d in near):
             return True
@@ -90,7 +92,7 @@ class Pairing(Generic[C, D]):
             return len(self._colors) > 1  # a later depth may belong to the next colour
         return len(self._depths) > len(near)
 
-    def _nearest(self, stamp: int, near: list[tuple[int, D]]) -> tuple[int, D] | None:
+    def _nearest(self, stamp: int, near: list[tuple[int, int, D]]) -> tuple[int, int, D] | None:
         """Return the nearest depth item that is not nearer to the next colour item."""
         after = self._colors[1][0] if len(self._colors) > 1 else None
         free = [d for d in near if after is None or abs(d[0] - stamp) <= abs(d[0] - after)]

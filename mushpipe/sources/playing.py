@@ -6,58 +6,29 @@ import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Set
 from dataclasses import replace
+from types import EllipsisType
 from typing import Any, TypeVar
 
 import numpy as np
 from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoders
 from mcap_ros2.decoder import DecoderFactory as Ros2Decoders
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
 
 from mushpipe.core import wire
 from mushpipe.core.errors import InputError
 from mushpipe.core.geometry import Camera
 from mushpipe.core.recording import Raw
-from mushpipe.core.stage import Source
 from mushpipe.core.types import Header, RgbdFrame
 from mushpipe.sources.doubts import doubts
 from mushpipe.sources.images import decode_camera, decode_color, decode_depth, distortion
 from mushpipe.sources.pairing import Pairing
+from mushpipe.sources.recorded import RecordedSource
 from mushpipe.sources.topics import Topics, is_beside, says_aligned
 
 T = TypeVar("T")
 logger = logging.getLogger("mushpipe")
 MOST_BESIDE = 256  # frames of which something waits that was recorded beside them
 NO_DEPTH = "%s has no depth: positions, distances and diameters will be missing"
-
-
-class Intrinsics(BaseModel):
-    """A pinhole camera without distortion, for recordings that carry no calibration."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    fx: float = Field(gt=0, description="focal length along x, px")
-    fy: float = Field(gt=0, description="focal length along y, px")
-    cx: float = Field(description="principal point, x, px")
-    cy: float = Field(description="principal point, y, px")
-
-
-class RecordedSource(Source):
-    """Settings of every source that reads recorded messages."""
-
-    color_topic: str | None = Field(None, description="colour images; chosen by name if not given")
-    depth_topic: str | None = Field(None, description="depth images aligned to colour")
-    camera_topic: str | None = Field(None, description="calibration of the colour images")
-    use_depth: bool = Field(True, description="false plays colour only")
-    depth_scale: float | None = Field(
-        None, gt=0, description="metres per unit of depth, where the recording does not say it"
-    )
-    pair_tolerance_ms: float = Field(
-        15.0, ge=0, description="largest difference of the stamps of a colour and a depth image"
-    )
-    camera: Intrinsics | None = Field(
-        None, description="intrinsics, in place of those of the recording"
-    )
 
 
 class Player:
@@ -99,6 +70,7 @@ class Player:
         self.size: tuple[int, ...] | None = None
         self._factories = (ProtobufDecoders(), Ros2Decoders())
         self._calibrated = ""  # frame of the calibration
+        self._stated = False  # whether there was a calibration, or word that there is none
         self._judged = False  # whether there was depth to be judged
         self._warned = False  # that a lens is left out
         self._found_beside: dict[tuple[int, int], dict[str, wire.Message]] = {}
@@ -132,18 +104,19 @@ class Player:
         self.counts["depth images without colour"] += pairing.depth_alone
 
     def _take(self, raw: Raw, pairing: Pairing[_Color, _Depth]) -> Iterator[RgbdFrame]:
+        number = raw.message.sequence if self.numbered else 0
         if raw.channel.topic == self.topics.camera:
             self.calibration(raw, "calibrations")
         elif raw.channel.topic == self.topics.depth:
             depth = self._decode(raw, self._depth)
             if depth:
-                yield from self._frames(pairing.add_depth(depth[0], depth[1]))
+                yield from self._frames(pairing.add_depth(*depth, number))
         else:
             color = self._decode(raw, self._color)
             if color and self.topics.depth is None:
                 yield self._frame(color, None)
             elif color:
-                yield from self._frames(pairing.add_color(color[0].stamp_ns, color))
+                yield from self._frames(pairing.add_color(color[0].stamp_ns, color, number))
 
     def _put_beside(self, raw: Raw) -> None:
         given = raw.schema
@@ -176,7 +149,7 @@ class Player:
                 self._warn_rectified()  # realsense2_camera's name, also where it rectified nothing
             return decode_camera(message, rectified)
 
-        self.camera = self._decode(raw, decode, what)
+        self.camera, self._stated = self._decode(raw, decode, what), True
         return self.camera
 
     def _warn_rectified(self) -> None:
@@ -210,8 +183,9 @@ class Player:
     def _color(self, message: Any, raw: Raw) -> _Color:
         stamp_ns, frame_id = _stamp(message, raw)
         header = Header(stamp_ns, raw.message.sequence, frame_id, raw.message.log_time)
-        # A calibration that changes holds from there on, not for images that wait for their depth.
-        return header, decode_color(message), self.camera
+        # A calibration that changes holds from there on, not for images that wait for their depth;
+        # the first one does.
+        return header, decode_color(message), self.camera if self._stated else ...
 
     def _depth(self, message: Any, raw: Raw) -> tuple[int, _Depth]:
         stated = raw.channel.metadata.get("depth_scale")
@@ -264,10 +238,10 @@ class Player:
         for doubt in doubts(known):
             logger.warning("%s, frame %d: %s", self.name, sequence, doubt)
 
-    def _camera(self, size: tuple[int, ...], recorded: Camera | None) -> Camera | None:
+    def _camera(self, size: tuple[int, ...], recorded: _Calibration) -> Camera | None:
         given = self.settings.camera
         if given is None:
-            return recorded or self.camera
+            return self.camera if recorded is ... else recorded
         return Camera(size[1], size[0], given.fx, given.fy, given.cx, given.cy)
 
     def _watch_size(self, size: tuple[int, ...], sequence: int) -> None:
@@ -277,7 +251,8 @@ class Player:
         self.size = size
 
 
-_Color = tuple[Header, Any, Camera | None]
+_Calibration = Camera | None | EllipsisType  # which is that nothing was stated yet
+_Color = tuple[Header, Any, _Calibration]
 _Depth = tuple[str, Any, float]
 
 

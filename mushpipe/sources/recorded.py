@@ -1,0 +1,36 @@
+"""Settings of every source that plays recorded messages."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from mushpipe.core.stage import Source
+
+
+class Intrinsics(BaseModel):
+    """A pinhole camera without distortion, for recordings that carry no calibration."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    fx: float = Field(gt=0, description="focal length along x, px")
+    fy: float = Field(gt=0, description="focal length along y, px")
+    cx: float = Field(description="principal point, x, px")
+    cy: float = Field(description="principal point, y, px")
+
+
+class RecordedSource(Source):
+    """Settings of every source that reads recorded messages."""
+
+    color_topic: str | None = Field(None, description="colour images; chosen by name if not given")
+    depth_topic: str | None = Field(None, description="depth images aligned to colour")
+    camera_topic: str | None = Field(None, description="calibration of the colour images")
+    use_depth: bool = Field(True, description="false plays colour only")
+    depth_scale: float | None = Field(
+        None, gt=0, description="metres per unit of depth, where the recording does not say it"
+    )
+    pair_tolerance_ms: float = Field(
+        15.0, ge=0, description="largest difference of the stamps of a colour and a depth image"
+    )
+    camera: Intrinsics | None = Field(
+        None, description="intrinsics, in place of those of the recording"
+    )
