@@ -70,10 +70,8 @@ class McapSource(RecordedSource, ReplaySource):
         index = reader.index()
         if not index.counts and reader.damage:
             raise InputError(f"{self.path}: {'; '.join(reader.damage)}; nothing could be read")
-        topics = choose_topics(
-            index, self.path, self.color_topic, self.depth_topic, self.camera_topic
-        )
-        return index, topics if self.use_depth else replace(topics, depth=None)
+        named = (self.color_topic, self.depth_topic, self.camera_topic)
+        return index, choose_topics(index, self.path, *named, self.use_depth)
 
     def counts(self) -> dict[str, int]:
         """Return how many images found no partner or could not be decoded."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +19,8 @@ IMAGES = {
 CALIBRATIONS = {"sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration"}
 _NOT_CAMERA = (RESULT_PREFIX, "/truth/")
 ALIGNED = "aligned_depth_to_color"
+# What parts of a topic say of the images, and not of the camera.
+_OF_IMAGES = re.compile("colou?r|rgb|depth|image|rect|registered|stereo|infra|compressed")
 _TRANSPORTS = ("/compressedDepth", "/compressed")
 
 
@@ -31,7 +34,12 @@ class Topics:
 
 
 def choose_topics(
-    index: Index, path: Path, color: str | None, depth: str | None, camera: str | None
+    index: Index,
+    path: Path,
+    color: str | None,
+    depth: str | None,
+    camera: str | None,
+    use_depth: bool = True,
 ) -> Topics:
     """Choose by schema and name; what the user names is taken as it is.
 
@@ -39,8 +47,8 @@ def choose_topics(
     ``camera_info`` beside the colour image.
 
     Raises:
-        InputError: No colour images, several candidates, or a named topic is not there or
-            holds something else.
+        InputError: No colour images, several candidates, depth of another camera, or a named topic
+            is not there or holds something else.
     """
     for wanted, kinds in ((color, IMAGES), (depth, IMAGES), (camera, CALIBRATIONS)):
         if wanted is not None:
@@ -50,7 +58,16 @@ def choose_topics(
     if color is None:
         found = ", ".join(sorted(index.channels)) or "no topics at all"
         raise InputError(f"{path}: it holds no colour images (it holds {found})")
-    depth = depth or _one(path, "depth", _depths(images))
+    if not use_depth:
+        depth = None
+    elif depth is None:
+        depth = _one(path, "depth", _depths(images))
+        if depth and _other_camera(depth, color):
+            raise InputError(
+                f"{path}: by its name, depth ({depth}) is of another camera than colour ({color}): "
+                f"where it is aligned to it, name it (--set source.depth_topic={depth}); or play "
+                "without it: --set source.use_depth=false"
+            )
     return Topics(color, depth, camera or _calibration(index, path, color))
 
 
@@ -108,6 +125,15 @@ def says_aligned(depth: str, color: str) -> bool:
     """Return whether names say that depth is aligned to these colour images, of one camera."""
     camera, found, _ = depth.lower().partition(ALIGNED)
     return bool(found) and color.lower().startswith(camera)
+
+
+def _other_camera(depth: str, color: str) -> bool:
+    """Return whether two topics name two cameras: /left/color/image and /right/depth/image."""
+    cameras = [
+        [part for part in topic.lower().split("/") if part and not _OF_IMAGES.search(part)]
+        for topic in (depth, color)
+    ]
+    return any(a != b for a, b in zip(*cameras, strict=False))
 
 
 def _one(path: Path, role: str, candidates: list[str]) -> str | None:

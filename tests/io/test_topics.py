@@ -193,7 +193,7 @@ def test_depth_aligned_to_something_else_is_no_depth_of_these_images(
     topic: str, tmp_path: Path
 ) -> None:
     other = raw_image(depth_pixels(0), "16UC1", frame_id="another_optical_frame")
-    text = refusal(tmp_path, [color_at(0), (topic, T0 + 1, other)])
+    text = refusal(tmp_path, [color_at(0), (topic, T0 + 1, other)], depth_topic=topic)
     assert text.startswith(f"depth ({topic}) is in frame 'another_optical_frame', colour in")
 
 
@@ -250,3 +250,32 @@ def test_aligned_depth_of_another_size_is_refused(tmp_path: Path) -> None:
     small = raw_image(depth_pixels(0, (4, 3)), "16UC1")
     text = refusal(tmp_path, [color_at(0), (ALIGNED, T0 + 1, small)])
     assert "frame 0: depth has shape (3, 4), colour (6, 8)" in text
+
+
+@pytest.mark.parametrize(
+    ("color", "depth", "same"),
+    [
+        ("/left/color/image_raw", "/right/depth/image_raw", False),
+        ("/cam0/image_color", "/cam1/image_depth", False),
+        ("/robot1/camera/rgb/image_raw", "/robot2/camera/depth/image_raw", False),
+        ("/camera/color/image_raw", "/camera/depth/image_rect_raw", True),
+        ("/rgb/image_raw", "/depth_to_rgb/image_raw", True),
+        ("/camera/rgb/image_rect_color", "/camera/depth_registered/image_raw", True),
+        ("/zed/zed_node/rgb/image_rect_color", "/zed/zed_node/depth/depth_registered", True),
+        ("/color", "/depth", True),
+    ],
+)
+def test_depth_of_another_camera_is_taken_only_where_it_is_named(
+    color: str, depth: str, same: bool, tmp_path: Path
+) -> None:
+    """Though it claims to be in the same frame."""
+    names = {COLOR: color, ALIGNED: depth}
+    path = write_bag(tmp_path, [(names.get(topic, topic), at, m) for topic, at, m in rgbd([0])])
+    if same:
+        assert play(path)[0].depth is not None
+        return
+    said = rf"by its name, depth \({depth}\) is of another camera than colour \({color}\)"
+    with pytest.raises(InputError, match=said):
+        play(path)
+    assert play(path, depth_topic=depth)[0].depth is not None
+    assert play(path, use_depth=False)[0].depth is None
