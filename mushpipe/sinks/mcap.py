@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
-from glob import escape
+from itertools import count, takewhile
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -59,12 +60,19 @@ class McapSink(Sink):
         path = run.path(self.path)
         if self.split_size is None:
             return (path,)
-        parts = path.parent.glob(f"{escape(path.stem)}_[0-9]*{path.suffix}")
+        names = re.compile(
+            rf"{re.escape(path.stem)}_(\d{{3}}|[1-9]\d{{3,5}}){re.escape(path.suffix)}"
+        )
+        parts = (other for other in path.parent.glob("*") if names.fullmatch(other.name))
         return tuple(sorted({part(path, 0), *parts}))
 
     def open(self, run: RunInfo) -> None:
-        """Create the file and write the manifest."""
+        """Create the file and write the manifest; parts that a run before left go."""
         self._run, self._part = run, 0
+        if self.split_size is not None and self.path != STDIO:
+            path = run.path(self.path)
+            for old in takewhile(Path.exists, (part(path, number) for number in count(1))):
+                old.unlink()
         self._base = base_of(run.manifest.get("graph", {}))
         self._writer = self._begin(run)
 

@@ -277,3 +277,22 @@ def test_viewers_are_told_where_the_camera_is_in_the_robots_frame(tmp_path: Path
     assert [rotation.x, rotation.y, rotation.z, rotation.w] == base["quaternion"]
     (trace,) = read_traces(tmp_path / "a.mcap")
     assert set(trace.outputs) == {"pick"}
+
+
+def test_a_shorter_run_leaves_no_parts_of_the_one_before_and_touches_nothing_else(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "row.mcap"
+    others = [tmp_path / f"row_{name}.mcap" for name in ("7", "20261126", "b_001", "left")]
+    for other in others:
+        other.write_bytes(b"another recording")
+    lengths = []
+    for frames in (6, 2):
+        record(path, [trace_of(make_frame(k)) for k in range(frames)], split_size=1)
+        parts = sorted(set(tmp_path.iterdir()) - set(others))
+        assert [each.name for each in parts] == [f"row_{k:03d}.mcap" for k in range(len(parts))]
+        lengths.append(len(parts))
+    assert lengths[0] > lengths[1] > 0
+    assert {other.read_bytes() for other in others} == {b"another recording"}
+    sink = McapSink(path=path, split_size=1)
+    assert set(sink.files(RunInfo("", {}))) == set(parts)
