@@ -66,7 +66,8 @@ def record(
         for key, flag, value in limits
         if value is not None
     ]
-    settings = {"path": str(out), "timing": False}
+    # The sink looks once more: opening a camera takes time, in which another may have recorded it.
+    settings = {"path": str(out), "timing": False, "overwrite": False}
     settings |= {"jpeg_quality": JPEG_QUALITY} if colour is Colour.jpeg else {}
     settings |= {"split_size": split_size} if split_size is not None else {}
     if out == STDIO and split_size is not None:
@@ -107,9 +108,10 @@ def _files(plan: Plan) -> list[Path]:
 
 def _refuse_to_overwrite(plan: Plan) -> None:
     from mushpipe.core.errors import UsageError
+    from mushpipe.core.recorder import EXISTS
 
     for path in _files(plan):
-        raise UsageError(f"{path} exists already: give the recording another name, or delete it")
+        raise UsageError(EXISTS.format(path))
 
 
 def _show_files(plan: Plan, report: RunReport) -> None:

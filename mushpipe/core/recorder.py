@@ -26,6 +26,7 @@ from mushpipe.core.types import Header, RgbdFrame
 # mcap's writer has no setting for the level. At zstandard's own, 3, images take three times as long
 # and come out a sixth smaller.
 _LEVEL = 1
+EXISTS = "{} exists already: give the recording another name, or delete it"
 mcap.writer.zstandard = SimpleNamespace(  # type: ignore[assignment, attr-defined]
     compress=partial(zstandard.compress, level=_LEVEL)
 )
@@ -44,7 +45,8 @@ class RecordingWriter:
     Raises:
         RecordingError: Also from every method: the output takes no more. What was written before
             stays readable.
-        UsageError: Standard output is a terminal.
+        UsageError: Standard output is a terminal, another run writes the file, or it is there and
+            not to be written over.
     """
 
     def __init__(
@@ -52,9 +54,10 @@ class RecordingWriter:
         path: Path,
         metadata: Mapping[str, Mapping[str, str]],
         compression: Literal["zstd", "lz4"] = "zstd",
+        overwrite: bool = True,
     ) -> None:
         stream = path == STDIO
-        self._output = _Output(_standard_output() if stream else _create(path), path)
+        self._output = _Output(_standard_output() if stream else _create(path, overwrite), path)
         self._writer = Writer(
             cast(IO[bytes], self._output),
             compression=CompressionType[compression.upper()],
@@ -185,11 +188,14 @@ class _Output:
         self._file.close()
 
 
-def _create(path: Path) -> FileIO:
+def _create(path: Path, overwrite: bool) -> FileIO:
     """Open a file that no other run is writing, and empty it."""
     try:
         file = opened_alone(path)
-        if path.is_file():
+        if path.is_file() and path.stat().st_size:
+            if not overwrite:
+                file.close()
+                raise UsageError(EXISTS.format(path))
             file.truncate(0)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error

@@ -46,6 +46,7 @@ class McapSink(Sink):
     split_size: ByteSize | None = Field(
         None, ge=1, description="begin a new file when one has this size, 2GB say; each is complete"
     )
+    overwrite: bool = Field(True, description="false refuses to write over a file that is there")
 
     _run: RunInfo | None = PrivateAttr(None)
     _part: int = PrivateAttr(0)
@@ -69,7 +70,7 @@ class McapSink(Sink):
     def open(self, run: RunInfo) -> None:
         """Create the file and write the manifest; parts that a run before left go."""
         self._run, self._part = run, 0
-        if self.split_size is not None and self.path != STDIO:
+        if self.split_size is not None and self.path != STDIO and self.overwrite:
             path = run.path(self.path)
             for old in takewhile(Path.exists, (part(path, number) for number in count(1))):
                 old.unlink()
@@ -83,7 +84,7 @@ class McapSink(Sink):
         manifest = {"json": json.dumps(dict(run.manifest))}
         if path == STDIO and run.live:
             manifest["live"] = "true"
-        return RecordingWriter(path, {MANIFEST: manifest}, self.compression)
+        return RecordingWriter(path, {MANIFEST: manifest}, self.compression, self.overwrite)
 
     def consume(self, trace: Trace) -> None:
         """Write one frame and its results."""

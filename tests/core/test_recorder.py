@@ -40,7 +40,7 @@ def test_after_a_full_disk_nothing_is_written_even_when_there_is_room_again(
     """What follows a torn chunk could not be read; so the file ends with it."""
     path = tmp_path / "out.mcap"
     disk = Disk(path, room)
-    monkeypatch.setattr("mushpipe.core.recorder._create", lambda _: disk)
+    monkeypatch.setattr("mushpipe.core.recorder._create", lambda *_: disk)
     writer = RecordingWriter(path, {"note": {"a": "b"}})
     written = 0
 
@@ -84,3 +84,12 @@ def test_a_file_that_another_writer_has_open_is_left_alone(tmp_path: Path) -> No
     assert not reader.damage
     RecordingWriter(path, {}).close()  # the run is over
     assert not RecordingReader(path).index().counts
+
+
+def test_a_file_that_is_not_to_be_written_over_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "out.mcap"
+    RecordingWriter(path, {}, overwrite=False).close()
+    before = path.read_bytes()
+    with pytest.raises(UsageError, match=r"out\.mcap exists already: give the recording another"):
+        RecordingWriter(path, {}, overwrite=False)
+    assert path.read_bytes() == before
