@@ -20,7 +20,10 @@ def resolve_path(path: Path, info: ValidationInfo) -> Path:
         return path
     context = info.context or {}
     from_shell = info.field_name in context.get("from_shell", ())
-    return Path(os.path.normpath(Path("" if from_shell else context.get("base", "")) / path))
+    whole = Path("" if from_shell else context.get("base", "")) / path
+    short = Path(os.path.normpath(whole))
+    # ".." behind a link is beside what it leads to
+    return short if short.resolve() == whole.resolve() else whole
 
 
 GraphPath = Annotated[Path, AfterValidator(resolve_path)]

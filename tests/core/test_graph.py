@@ -14,6 +14,7 @@ from mushpipe.core.graph import compile_document
 from mushpipe.core.plugins import load_registry
 from mushpipe.sinks.mcap import McapSink
 from mushpipe.sinks.rerun import RerunSink
+from mushpipe.sources.mcap import McapSource
 from tests.core.lab import Lab, cli
 
 KEYS = st.sampled_from(
@@ -416,6 +417,18 @@ def test_paths_are_relative_to_the_graph_file_unless_the_shell_gives_them(lab: L
     assert str(given) == "bed.mcap"
     absolute = lab.compile(graph, "source.path=/data/bed.mcap").source.plugin.path
     assert str(absolute) == "/data/bed.mcap"
+
+
+def test_above_a_link_is_what_it_leads_to_as_in_the_shell(tmp_path: Path) -> None:
+    real, link = tmp_path / "station/graphs", tmp_path / "graphs"
+    real.mkdir(parents=True)
+    link.symlink_to(real)
+    for folder, content in ((tmp_path, b"another"), (real.parent, b"the one beside it")):
+        (folder / "bed.mcap").write_bytes(content)
+    text = "mushpipe: 1\nsource: {use: mcap, path: ../bed.mcap}\n"
+    plan = compile_document(parse_document(text, "g.yaml", link), load_registry())
+    assert isinstance(plan.source.plugin, McapSource)
+    assert plan.source.plugin.path.read_bytes() == b"the one beside it"
 
 
 def test_a_fault_at_the_top_does_not_hide_the_faults_below() -> None:
