@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from mushpipe.core.plugins import Registry, load_registry
-from mushpipe.core.stage import Kind, Plugin, ports_of
+from mushpipe.core.ports import ports_of
+from mushpipe.core.stage import Kind, Plugin
 from mushpipe.info import KINDS, settings_rows
 
 TITLES = {"source": "Sources", "stage": "Stages", "sink": "Sinks"}

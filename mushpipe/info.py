@@ -9,8 +9,9 @@ from typing import Any
 
 from mushpipe.core.errors import PluginError, suggest
 from mushpipe.core.plugins import Registry, class_in_file, in_file
+from mushpipe.core.ports import ports_of
 from mushpipe.core.recording import MANIFEST, RecordingReader
-from mushpipe.core.stage import Kind, Plugin, kind_of, ports_of
+from mushpipe.core.stage import Kind, Plugin, kind_of
 
 KINDS: tuple[Kind, ...] = ("source", "stage", "sink")
 

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from mushpipe.core.plan import Link, Node, Plan
+from mushpipe.core.plan import Node, Plan
 from mushpipe.core.stage import Stage
 from mushpipe.core.types import Mask, RgbdFrame, Trace
 
@@ -114,14 +114,14 @@ class Chain:
 
     def _call(self, node: Node, passage: Passage) -> tuple[Any, ...]:
         frame = passage.frame
-        arguments = {name: _follow(link, passage.outputs) for name, link in node.links.items()}
-        if node.ports.wants_rng:
+        arguments = _inputs(node, passage.outputs)
+        if node.ports.rng is not None:
             name_key = zlib.crc32(node.name.encode())
-            arguments["rng"] = np.random.default_rng(
+            arguments[node.ports.rng] = np.random.default_rng(
                 [self.plan.seed, name_key, frame.header.sequence]
             )
         result = node.plugin.process(**arguments)  # type: ignore[attr-defined]
-        values = result if isinstance(result, tuple) else (result,)
+        values = _values(result, node.ports.outputs)
         seen = [value for value in arguments.values() if isinstance(value, RgbdFrame)]
         _check_outputs(node, values, seen[0] if seen else frame)
         return values
@@ -155,15 +155,25 @@ def _reentrant(node: Node) -> bool:
 
 def sink_inputs(node: Node, trace: Trace) -> dict[str, Any]:
     """Return what a sink asks for, by the name of its parameter."""
-    inputs = {name: _follow(link, trace.outputs) for name, link in node.links.items()}
+    inputs = _inputs(node, trace.outputs)
     for port in node.ports.inputs:
         if port.type is Trace:
             inputs[port.name] = trace
     return inputs
 
 
-def _follow(link: Link, outputs: Mapping[str, tuple[Any, ...]]) -> Any:
-    return outputs[link.producer][link.output]
+def _inputs(node: Node, outputs: Mapping[str, tuple[Any, ...]]) -> dict[str, Any]:
+    """Return the inputs by the name of their parameter; the default of what nothing produces."""
+    inputs = {port.name: port.default for port in node.ports.inputs}
+    for name, link in node.links.items():
+        inputs[name] = outputs[link.producer][link.output]
+    return inputs
+
+
+def _values(result: Any, declared: tuple[type, ...]) -> tuple[Any, ...]:
+    """Return a stage's outputs; a tuple is one where the stage declares it to be."""
+    single = len(declared) == 1 and isinstance(result, declared[0])
+    return (result,) if single or not isinstance(result, tuple) else result
 
 
 def _check_outputs(node: Node, values: tuple[Any, ...], frame: RgbdFrame) -> None:

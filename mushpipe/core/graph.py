@@ -18,17 +18,8 @@ from mushpipe.core.overrides import apply_override, encoding_fault
 from mushpipe.core.overwriting import same_file
 from mushpipe.core.plan import Node, Plan
 from mushpipe.core.plugins import Registry, in_file
-from mushpipe.core.stage import (
-    OF_SOURCE,
-    WORDS,
-    Kind,
-    Plugin,
-    RunInfo,
-    Sink,
-    Source,
-    ports_of,
-    settings_of,
-)
+from mushpipe.core.ports import OF_SOURCE, ports_of
+from mushpipe.core.stage import WORDS, Kind, Plugin, RunInfo, Sink, Source, settings_of
 from mushpipe.core.wire import BASE_TOPIC, RESULT_PREFIX, TIMING_TOPIC, TOTAL
 from mushpipe.core.wiring import wire
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from mushpipe.core.stage import Kind, Plugin, Ports, Sink, Source
+from mushpipe.core.ports import Ports
+from mushpipe.core.stage import Kind, Plugin, Sink, Source
 
 
 class Link(NamedTuple):

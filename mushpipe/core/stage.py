@@ -1,29 +1,21 @@
-"""Stages, sources and sinks: settings as pydantic fields, ports as one typed signature."""
+"""Stages, sources and sinks: classes whose fields are their settings, checked by pydantic."""
 
 from __future__ import annotations
 
-import typing
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from inspect import Parameter, signature
 from pathlib import Path
-from types import NoneType, UnionType
 from typing import Any, ClassVar, Literal, Self
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from mushpipe.core.errors import PluginError
 from mushpipe.core.paths import STDIO, is_written
-from mushpipe.core.truth import BUILT_IN
-from mushpipe.core.types import Mask, RgbdFrame
+from mushpipe.core.types import RgbdFrame
 
 Kind = Literal["stage", "source", "sink"]
 WORDS = ("use", "inputs", "delivery")
 """What stands beside the settings of a node in a graph."""
-# Values are recorded under the names of their types.
-_TAKEN: dict[str, type] = {t.__name__: t for t in (*BUILT_IN, Mask, RgbdFrame)}
-_METHODS: dict[Kind, str] = {"stage": "process", "source": "frames", "sink": "consume"}
 
 
 @dataclass(frozen=True)
@@ -172,27 +164,6 @@ class Sink(Plugin):
         """Take the run's counts and timings, after the last frame and before `close`."""
 
 
-@dataclass(frozen=True)
-class Port:
-    """An input: parameter name, type, and whether a graph must provide it."""
-
-    name: str
-    type: type
-    required: bool
-
-
-@dataclass(frozen=True)
-class Ports:
-    """Inputs and outputs of a plugin, read from its signature."""
-
-    inputs: tuple[Port, ...]
-    outputs: tuple[type, ...]
-    wants_rng: bool
-
-
-OF_SOURCE = Ports((), (RgbdFrame,), False)
-
-
 def kind_of(plugin: type) -> Kind:
     """Return which of the three kinds a class is.
 
@@ -209,73 +180,3 @@ def kind_of(plugin: type) -> Kind:
 def settings_of(model: type[BaseModel]) -> dict[str, str]:
     """Return the settings' names in a graph file, each with its attribute of the model."""
     return {field.alias or name: name for name, field in model.model_fields.items()}
-
-
-def ports_of(plugin: type[Plugin]) -> Ports:
-    """Read the ports of a plugin class from the annotations of its method.
-
-    Raises:
-        PluginError: The method is missing, an annotation is missing or not a class, or a setting
-            has a name that a graph could not set.
-    """
-    for name in settings_of(plugin):
-        if name in WORDS:
-            raise PluginError(
-                f"{plugin.__qualname__}: a setting cannot be called '{name}', which in a graph "
-                "stands beside the settings; give it another name, or an alias"
-            )
-    if kind_of(plugin) == "source":
-        if plugin.frames is Source.frames:  # type: ignore[attr-defined]
-            raise PluginError(f"{plugin.__qualname__} has no method 'frames'")
-        return OF_SOURCE
-    name = _METHODS[kind_of(plugin)]
-    method = getattr(plugin, name, None)
-    if method is None:
-        raise PluginError(f"{plugin.__qualname__} has no method '{name}'")
-    try:
-        hints = typing.get_type_hints(method)
-    except Exception as error:  # an annotation in quotes can be any code
-        raise PluginError(f"{plugin.__qualname__}.{name}: unknown annotation: {error}") from error
-    inputs, wants_rng = [], False
-    for parameter in list(signature(method).parameters.values())[1:]:
-        port = _port(plugin, parameter, hints)
-        if port.type is np.random.Generator:
-            wants_rng = True
-        else:
-            inputs.append(port)
-    outputs = _outputs(plugin, hints) if kind_of(plugin) == "stage" else ()
-    return Ports(tuple(inputs), outputs, wants_rng)
-
-
-def _port(plugin: type[Plugin], parameter: Parameter, hints: dict[str, Any]) -> Port:
-    hint = hints.get(parameter.name)
-    required = parameter.default is Parameter.empty
-    members = typing.get_args(hint)
-    if isinstance(hint, UnionType) or typing.get_origin(hint) is typing.Union:
-        left = [member for member in members if member is not NoneType]
-        if len(left) == 1 and len(members) == 2:
-            hint, required = left[0], False
-    if not isinstance(hint, type) or parameter.kind is not Parameter.POSITIONAL_OR_KEYWORD:
-        raise PluginError(
-            f"{plugin.__qualname__}: parameter '{parameter.name}' must be annotated with one type"
-        )
-    return Port(parameter.name, hint, required)
-
-
-def _outputs(plugin: type[Plugin], hints: dict[str, Any]) -> tuple[type, ...]:
-    hint = hints.get("return")
-    outputs = typing.get_args(hint) if typing.get_origin(hint) is tuple else (hint,)
-    if not all(isinstance(t, type) and t is not NoneType for t in outputs):
-        raise PluginError(
-            f"{plugin.__qualname__}.process must be annotated with what it returns: "
-            "a type, or a tuple of types"
-        )
-    if len(set(outputs)) < len(outputs):
-        raise PluginError(f"{plugin.__qualname__}.process returns the same type twice")
-    for output in outputs:
-        if _TAKEN.get(output.__name__, output) is not output:
-            raise PluginError(
-                f"{plugin.__qualname__}.process returns a type '{output.__name__}' that is not "
-                f"mushpipe's: import mushpipe.{output.__name__}, or give your own another name"
-            )
-    return outputs

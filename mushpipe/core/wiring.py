@@ -6,7 +6,7 @@ from mushpipe.core.document import Document, Location
 from mushpipe.core.errors import MushpipeError, Problem, suggest
 from mushpipe.core.plan import Link, Node
 from mushpipe.core.plugins import Registry
-from mushpipe.core.stage import Port, ports_of
+from mushpipe.core.ports import Port, ports_of
 from mushpipe.core.tables import Circles, Locations, Poses
 from mushpipe.core.types import Trace
 

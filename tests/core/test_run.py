@@ -2,6 +2,7 @@
 
 import itertools
 import threading
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -104,6 +105,28 @@ def test_randomness_is_the_same_for_the_same_frame_wherever_it_comes(lab: Lab):
 
     lab.registry.source("late", Late)
     assert rolls(lab, lab.chain("dice", source="late")) == rolls(lab, lab.chain("dice"))[2:]
+
+
+def test_the_random_generator_may_have_any_name(lab: Lab):
+    class Roll(Stage):
+        def process(self, frame: RgbdFrame, chance: np.random.Generator) -> Circles:
+            return circles(1 + chance.random())
+
+    assert rolls(lab, lab.chain(Roll)) == rolls(lab, lab.chain("dice"))
+
+
+class Pair(NamedTuple):
+    level: int
+    row: int
+
+
+def test_an_output_may_be_a_tuple_of_its_own_type(lab: Lab):
+    class Find(Stage):
+        def process(self, frame: RgbdFrame) -> Pair:
+            return Pair(int(frame.color[0, 0, 0]), 5)
+
+    assert lab.run(lab.chain(Find)).error is None
+    assert [trace.outputs["a"] for trace in lab.seen] == [(Pair(level, 5),) for level in range(3)]
 
 
 class Writes(Stage):

@@ -20,7 +20,7 @@ from mushpipe import (
 )
 from mushpipe.core.errors import PluginError
 from mushpipe.core.plan import Link
-from mushpipe.core.stage import Port, Ports, ports_of
+from mushpipe.core.ports import Port, Ports, ports_of
 from tests.core.lab import Both, Dice, Frames, Invert, Lab, cli
 
 
@@ -39,10 +39,10 @@ def old_optional(self, mask: typing.Optional[Mask]) -> Mask:  # noqa: UP045
 @pytest.mark.parametrize(
     ("plugin", "ports"),
     [
-        (Invert, Ports((Port("mask", Mask, True),), (Mask,), False)),
-        (Both, Ports((Port("frame", RgbdFrame, True),), (Mask, Circles), False)),
-        (Dice, Ports((Port("frame", RgbdFrame, True),), (Circles,), True)),
-        (Frames, Ports((), (RgbdFrame,), False)),
+        (Invert, Ports((Port("mask", Mask, True),), (Mask,))),
+        (Both, Ports((Port("frame", RgbdFrame, True),), (Mask, Circles))),
+        (Dice, Ports((Port("frame", RgbdFrame, True),), (Circles,), "rng")),
+        (Frames, Ports((), (RgbdFrame,))),
         (
             declared(optional),
             Ports(
@@ -52,10 +52,9 @@ def old_optional(self, mask: typing.Optional[Mask]) -> Mask:  # noqa: UP045
                     Port("circles", Circles, False),
                 ),
                 (Mask,),
-                False,
             ),
         ),
-        (declared(old_optional), Ports((Port("mask", Mask, False),), (Mask,), False)),
+        (declared(old_optional), Ports((Port("mask", Mask, False),), (Mask,))),
     ],
 )
 def test_ports_are_read_from_the_signature(plugin, ports):
@@ -71,10 +70,20 @@ def no_return(self, frame: RgbdFrame): ...
 def none_return(self, frame: RgbdFrame) -> None: ...
 def optional_return(self, frame: RgbdFrame) -> Mask | None: ...
 def any_number(self, frame: RgbdFrame) -> tuple[Mask, ...]: ...
+def anything(self, frame: RgbdFrame) -> Any: ...
+def of_anything(self, frame: Any) -> Mask: ...
+def selfless(frame: RgbdFrame) -> Mask: ...
+def without_any() -> Mask: ...
+def two_dice(self, a: np.random.Generator, b: np.random.Generator) -> Mask: ...
+async def later(self, frame: RgbdFrame) -> Mask: ...
 def twice(self, frame: RgbdFrame) -> tuple[Mask, Mask]: ...
 def namesake(self, frame: RgbdFrame) -> type("Circles", (Columns,), {}): ...
 def unknown(self, frame: "Frame") -> Mask: ...  # noqa: F821
 def unknown_part(self, frame: "np.no_such_thing") -> Mask: ...
+
+
+def one_by_one(self, frame: RgbdFrame) -> Mask:
+    yield Mask(frame.gray > 0)
 
 
 RETURNS = "Declared.process must be annotated with what it returns: a type, or a tuple of types"
@@ -92,6 +101,13 @@ RETURNS = "Declared.process must be annotated with what it returns: a type, or a
         (none_return, RETURNS),
         (optional_return, RETURNS),
         (any_number, RETURNS),
+        (anything, RETURNS),
+        (of_anything, "Declared: parameter 'frame' must be annotated with one type"),
+        (selfless, "Declared.process: its first parameter must be 'self'"),
+        (without_any, "Declared.process: its first parameter must be 'self'"),
+        (two_dice, "Declared: parameter 'b': a stage gets one random generator, a sink none"),
+        (later, "Declared.process is 'async', which nobody awaits: make it a plain method"),
+        (one_by_one, "Declared.process yields: it must return what it makes of one frame"),
         (twice, "Declared.process returns the same type twice"),
         (namesake, "Declared.process returns a type 'Circles' that is not mushpipe's"),
         (unknown, "Declared.process: unknown annotation: name 'Frame' is not defined"),
@@ -102,6 +118,22 @@ def test_a_signature_that_says_too_little(lab: Lab, process, message):
     lab.registry.stage("declared", declared(process))
     fault = lab.faults("mushpipe: 1\nsource: {use: frames}\nstages:\n  a: {use: declared}\n")
     assert fault.startswith(f"graph.yaml:4:12: {message}")
+
+
+async def consume_later(self, frame: RgbdFrame) -> None: ...
+def consume_dice(self, rng: np.random.Generator) -> None: ...
+
+
+@pytest.mark.parametrize(
+    ("consume", "message"),
+    [
+        (consume_later, "Declared.consume is 'async', which nobody awaits"),
+        (consume_dice, "Declared: parameter 'rng': a stage gets one random generator, a sink none"),
+    ],
+)
+def test_a_sink_that_could_not_be_called(consume, message):
+    with pytest.raises(PluginError, match=f"^{message}"):
+        ports_of(type("Declared", (Sink,), {"consume": consume}))
 
 
 @pytest.mark.parametrize("word", ["use", "inputs", "delivery"])
@@ -182,6 +214,40 @@ def test_an_optional_input_may_have_no_producer(lab: Lab):
     found = links(lab, lab.chain(declared(optional), declared(optional)))
     assert found["a"] == {"frame": Link("source", 0)}
     assert found["b"] == {"frame": Link("source", 0), "mask": Link("a", 0)}
+
+
+def test_an_optional_input_without_producer_is_its_default_or_none(lab: Lab):
+    unknown = Poses.unknown(2)
+    seen: list[Any] = []
+
+    class Ready(Sink):
+        def consume(self, circles: Circles | None) -> None:
+            seen.append(circles)
+
+    class Given(Stage):
+        def process(self, frame: RgbdFrame, mask: Mask | None, poses: Poses = unknown) -> Mask:  # type: ignore[assignment]
+            seen.extend([mask, poses])
+            return Mask(frame.gray > 0)
+
+    lab.registry.sink("ready", Ready)
+    report = lab.run(lab.chain(Given).replace("collect", "ready"), "source.count=1")
+    assert report.error is None
+    assert seen == [None, unknown, None]
+
+
+def test_a_method_may_be_static_or_of_the_class(lab: Lab):
+    class Static(Stage):
+        @staticmethod
+        def process(frame: RgbdFrame) -> Mask:
+            return Mask(frame.color[..., 0] > 1)
+
+    class OfClass(Stage):
+        @classmethod
+        def process(cls, mask: Mask) -> Circles:
+            return Circles([[0, 0]], [1 + mask.foreground.sum()], [1])
+
+    assert lab.run(lab.chain(Static, OfClass)).error is None
+    assert [trace.outputs["b"][0].radius[0] for trace in lab.seen] == [1, 1, 49]
 
 
 def test_a_setting_can_make_an_optional_input_a_required_one(lab: Lab):

@@ -1,0 +1,134 @@
+"""Ports: what a plugin takes and returns, read from the signature of one method."""
+
+from __future__ import annotations
+
+import inspect
+import typing
+from dataclasses import dataclass
+from inspect import Parameter
+from types import NoneType, UnionType
+from typing import Any
+
+import numpy as np
+
+from mushpipe.core.errors import PluginError
+from mushpipe.core.stage import WORDS, Kind, Plugin, Source, kind_of, settings_of
+from mushpipe.core.truth import BUILT_IN
+from mushpipe.core.types import Mask, RgbdFrame
+
+# Values are recorded under the names of their types.
+_TAKEN: dict[str, type] = {t.__name__: t for t in (*BUILT_IN, Mask, RgbdFrame)}
+_METHODS: dict[Kind, str] = {"stage": "process", "source": "frames", "sink": "consume"}
+
+
+@dataclass(frozen=True)
+class Port:
+    """An input: parameter name, type, whether a graph must provide it, and what it gets if not."""
+
+    name: str
+    type: type
+    required: bool
+    default: Any = None
+
+
+@dataclass(frozen=True)
+class Ports:
+    """Inputs and outputs of a plugin; ``rng`` is the parameter that takes a random generator."""
+
+    inputs: tuple[Port, ...]
+    outputs: tuple[type, ...]
+    rng: str | None = None
+
+
+OF_SOURCE = Ports((), (RgbdFrame,))
+
+
+def ports_of(plugin: type[Plugin]) -> Ports:
+    """Read the ports of a plugin class from the annotations of its method.
+
+    Raises:
+        PluginError: The method is missing or cannot be called frame by frame, an annotation is
+            missing or not a class, or a setting has a name that a graph could not set.
+    """
+    for name in settings_of(plugin):
+        if name in WORDS:
+            raise PluginError(
+                f"{plugin.__qualname__}: a setting cannot be called '{name}', which in a graph "
+                "stands beside the settings; give it another name, or an alias"
+            )
+    kind = kind_of(plugin)
+    method, parameters = _method(plugin, kind)
+    if kind == "source":
+        return OF_SOURCE
+    try:
+        hints = typing.get_type_hints(method)
+    except Exception as error:  # an annotation in quotes can be any code
+        where = f"{plugin.__qualname__}.{_METHODS[kind]}"
+        raise PluginError(f"{where}: unknown annotation: {error}") from error
+    ports = [_port(plugin, parameter, hints) for parameter in parameters]
+    random = [port.name for port in ports if port.type is np.random.Generator]
+    if len(random) > (kind == "stage"):
+        raise PluginError(
+            f"{plugin.__qualname__}: parameter '{random[-1]}': a stage gets one random generator, "
+            "a sink none"
+        )
+    inputs = tuple(port for port in ports if port.name not in random)
+    outputs = _outputs(plugin, hints) if kind == "stage" else ()
+    return Ports(inputs, outputs, random[0] if random else None)
+
+
+def _method(plugin: type[Plugin], kind: Kind) -> tuple[Any, list[Parameter]]:
+    """Return the method that a run calls, and its parameters without ``self``."""
+    name = _METHODS[kind]
+    method, where = getattr(plugin, name, None), f"{plugin.__qualname__}.{name}"
+    if method is None or method is Source.frames:
+        raise PluginError(f"{plugin.__qualname__} has no method '{name}'")
+    if inspect.iscoroutinefunction(method) or inspect.isasyncgenfunction(method):
+        raise PluginError(f"{where} is 'async', which nobody awaits: make it a plain method")
+    if kind != "source" and inspect.isgeneratorfunction(method):
+        raise PluginError(f"{where} yields: it must return what it makes of one frame")
+    parameters = list(inspect.signature(method).parameters.values())
+    if isinstance(inspect.getattr_static(plugin, name), staticmethod | classmethod):
+        return method, parameters
+    if not parameters or parameters[0].name != "self":
+        raise PluginError(f"{where}: its first parameter must be 'self'")
+    return method, parameters[1:]
+
+
+def _port(plugin: type[Plugin], parameter: Parameter, hints: dict[str, Any]) -> Port:
+    hint = hints.get(parameter.name)
+    required = parameter.default is Parameter.empty
+    default = None if required else parameter.default
+    members = typing.get_args(hint)
+    if isinstance(hint, UnionType) or typing.get_origin(hint) is typing.Union:
+        left = [member for member in members if member is not NoneType]
+        if len(left) == 1 and len(members) == 2:
+            hint, required = left[0], False
+    if not _is_class(hint) or parameter.kind is not Parameter.POSITIONAL_OR_KEYWORD:
+        raise PluginError(
+            f"{plugin.__qualname__}: parameter '{parameter.name}' must be annotated with one type"
+        )
+    return Port(parameter.name, hint, required, default)
+
+
+def _is_class(hint: Any) -> typing.TypeGuard[type]:
+    return isinstance(hint, type) and hint is not Any  # which is a class in Python 3.11
+
+
+def _outputs(plugin: type[Plugin], hints: dict[str, Any]) -> tuple[type, ...]:
+    hint = hints.get("return")
+    outputs = typing.get_args(hint) if typing.get_origin(hint) is tuple else (hint,)
+    if not all(_is_class(t) and t is not NoneType for t in outputs):
+        raise PluginError(
+            f"{plugin.__qualname__}.process must be annotated with what it returns: "
+            "a type, or a tuple of types"
+        )
+    if len(set(outputs)) < len(outputs):
+        raise PluginError(f"{plugin.__qualname__}.process returns the same type twice")
+    for output in outputs:
+        if _TAKEN.get(output.__name__, output) is not output:
+            raise PluginError(
+                f"{plugin.__qualname__}.process returns a type '{output.__name__}' that is not "
+                f"mushpipe's: import mushpipe.{output.__name__}, or give your own another name"
+            )
+    return outputs
