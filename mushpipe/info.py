@@ -11,6 +11,7 @@ from mushpipe.core.errors import PluginError, suggest
 from mushpipe.core.plugins import Registry, class_in_file, in_file
 from mushpipe.core.ports import ports_of
 from mushpipe.core.recording import MANIFEST, RecordingReader
+from mushpipe.core.schema import settings_schema
 from mushpipe.core.stage import Kind, Plugin, kind_of
 
 KINDS: tuple[Kind, ...] = ("source", "stage", "sink")
@@ -132,7 +133,7 @@ def _describe_class(kind: Kind, name: str, plugin: type[Plugin]) -> str:
 
 def settings_rows(plugin: type[Plugin]) -> list[tuple[str, ...]]:
     """Return name, type, default and meaning of each setting of a plugin."""
-    return _settings(plugin.model_json_schema())
+    return _settings(settings_schema(plugin))
 
 
 def _settings(schema: dict[str, Any], prefix: str = "") -> list[tuple[str, ...]]:

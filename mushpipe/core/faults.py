@@ -9,7 +9,7 @@ from pydantic import BaseModel, ValidationError
 
 from mushpipe.core.document import Document, Location
 from mushpipe.core.errors import Problem, suggest
-from mushpipe.core.stage import settings_of
+from mushpipe.core.settings import settings_of
 
 
 def faults_of(

@@ -19,7 +19,14 @@ from mushpipe.core.overwriting import same_file
 from mushpipe.core.plan import Node, Plan
 from mushpipe.core.plugins import Registry, in_file
 from mushpipe.core.ports import OF_SOURCE, ports_of
-from mushpipe.core.stage import WORDS, Kind, Plugin, RunInfo, Sink, Source, settings_of
+from mushpipe.core.settings import (
+    WORDS,
+    default_paths,
+    read_settings,
+    settings_of,
+    writing_fault,
+)
+from mushpipe.core.stage import Kind, Plugin, RunInfo, Sink, Source
 from mushpipe.core.wire import BASE_TOPIC, RESULT_PREFIX, TIMING_TOPIC, TOTAL
 from mushpipe.core.wiring import wire
 
@@ -230,23 +237,24 @@ def _node(
         settings = _drop_foreign(document, at, use, plugin_class, settings)
         inputs = {k: v for k, v in inputs.items() if k in {port.name for port in ports.inputs}}
     try:
-        plugin = plugin_class.model_validate_json(
-            json.dumps(settings),
-            strict=True,
-            context={"base": document.base.absolute(), "from_shell": document.from_shell(at)},
-        )
+        settings = {**default_paths(plugin_class, settings), **settings}
+        shell = document.from_shell(at)
+        plugin = read_settings(plugin_class, settings, document.base.absolute(), shell)
     except ValidationError as error:
         problems += faults_of(document, at, error, plugin_class, use)
         # never run, but its ports say whether it is wired
         unset = plugin_class.model_construct()
         return Node(str(at[-1]), kind, use, unset, ports, dict(inputs), delivery)
+    if fault := writing_fault(plugin):
+        message = f"the settings of '{use}' cannot be written into a graph and read again: {fault}"
+        problems.append(document.problem((*at, "use"), message))
     if in_file(use):
         use = str((base / use).resolve())
     attributes = settings_of(plugin_class)
     paths = {
         key: str(value)
         for key, value in settings.items()
-        if isinstance(getattr(plugin, attributes[key]), Path)
+        if isinstance(getattr(plugin, attributes.get(key, key), None), Path)
     }
     return Node(str(at[-1]), kind, use, plugin, ports, dict(inputs), delivery, paths=paths)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from mushpipe.core.ports import Ports
+from mushpipe.core.settings import written_settings
 from mushpipe.core.stage import Kind, Plugin, Sink, Source
 
 
@@ -37,8 +38,7 @@ class Node:
 
     def resolved(self) -> dict[str, Any]:
         """Return the node's entry in a graph file, with every setting written out."""
-        settings = self.plugin.model_dump(mode="json", by_alias=True)
-        entry: dict[str, Any] = {"use": self.use, **settings}
+        entry: dict[str, Any] = {"use": self.use, **written_settings(self.plugin)}
         if self.asked:
             entry["inputs"] = self.asked
         if self.delivery:

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from mushpipe.core.errors import PluginError
-from mushpipe.core.stage import WORDS, Kind, Plugin, Source, kind_of, settings_of
+from mushpipe.core.settings import WORDS, settings_of
+from mushpipe.core.stage import Kind, Plugin, Source, kind_of
 from mushpipe.core.truth import BUILT_IN
 from mushpipe.core.types import Mask, RgbdFrame
 

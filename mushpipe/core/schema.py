@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
+
 from mushpipe.core.errors import MushpipeError
 from mushpipe.core.graph import GraphFile
 from mushpipe.core.plugins import Registry
-from mushpipe.core.stage import Kind
+from mushpipe.core.stage import Kind, Plugin
 
 
 def graph_schema(registry: Registry) -> dict[str, Any]:
@@ -26,6 +28,20 @@ def graph_schema(registry: Registry) -> dict[str, Any]:
     }
 
 
+class _Lenient(GenerateJsonSchema):
+    """Lets a setting be anything where JSON has no word for its type."""
+
+    ignored_warning_kinds = {"skipped-choice", "non-serializable-default"}  # noqa: RUF012
+
+    def handle_invalid_for_json_schema(self, *_: Any) -> JsonSchemaValue:
+        return {}
+
+
+def settings_schema(plugin: type[Plugin], template: str = "#/$defs/{model}") -> dict[str, Any]:
+    """Return the schema of a plugin's settings; the template is that of references in it."""
+    return plugin.model_json_schema(ref_template=template, schema_generator=_Lenient)
+
+
 def _one_of(registry: Registry, kind: Kind, definitions: dict[str, Any]) -> dict[str, Any]:
     """A chain of if/then on ``use``: editors complete it better than oneOf."""
     rules, names = [], []
@@ -35,7 +51,7 @@ def _one_of(registry: Registry, kind: Kind, definitions: dict[str, Any]) -> dict
         except MushpipeError:
             continue
         names.append(name)
-        own = plugin.model_json_schema(ref_template=f"#/$defs/{kind}.{name}.{{model}}")
+        own = settings_schema(plugin, f"#/$defs/{kind}.{name}.{{model}}")
         for model, definition in own.pop("$defs", {}).items():
             definitions[f"{kind}.{name}.{model}"] = definition
         own["properties"] = {"use": {"const": name}, "inputs": {"type": "object"}} | own.get(

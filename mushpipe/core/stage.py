@@ -14,8 +14,6 @@ from mushpipe.core.paths import STDIO, is_written
 from mushpipe.core.types import RgbdFrame
 
 Kind = Literal["stage", "source", "sink"]
-WORDS = ("use", "inputs", "delivery")
-"""What stands beside the settings of a node in a graph."""
 
 
 @dataclass(frozen=True)
@@ -175,8 +173,3 @@ def kind_of(plugin: type) -> Kind:
         if isinstance(plugin, type) and issubclass(plugin, base):
             return kind
     raise PluginError(f"{plugin!r} is not a Stage, Source or Sink class")
-
-
-def settings_of(model: type[BaseModel]) -> dict[str, str]:
-    """Return the settings' names in a graph file, each with its attribute of the model."""
-    return {field.alias or name: name for name, field in model.model_fields.items()}

@@ -1,13 +1,16 @@
 """Compiling graph files: what a plan holds, and the words for every kind of fault."""
 
 from pathlib import Path
+from typing import Annotated
 
+import numpy as np
 import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import AfterValidator, ConfigDict, Field, Json, computed_field
 
-from mushpipe import RunInfo, Sink, SinkPath
+from mushpipe import Mask, RgbdFrame, RunInfo, Sink, SinkPath, Stage
 from mushpipe.core.document import Document, parse_document, read_document
 from mushpipe.core.errors import GraphError
 from mushpipe.core.graph import compile_document
@@ -429,6 +432,102 @@ def test_above_a_link_is_what_it_leads_to_as_in_the_shell(tmp_path: Path) -> Non
     plan = compile_document(parse_document(text, "g.yaml", link), load_registry())
     assert isinstance(plan.source.plugin, McapSource)
     assert plan.source.plugin.path.read_bytes() == b"the one beside it"
+
+
+@pytest.mark.parametrize("default", [Path("x/{recording}.csv"), "x/{recording}.csv"])
+def test_default_paths_are_relative_to_the_graph_file(lab: Lab, default: Path):
+    class Rows(Sink):
+        path: SinkPath = default
+
+        def consume(self) -> None: ...
+
+    lab.registry.sink("rows", Rows)
+    graph = "mushpipe: 1\nsource: {use: frames}\nsinks: {rows: {use: rows}}\n"
+    (node,) = lab.compile(graph).sinks
+    assert node.plugin.path == lab.folder.absolute() / "x/{recording}.csv"
+    assert node.paths == {"path": "x/{recording}.csv"}
+    (given,) = lab.compile(graph, "rows.path=y.csv").sinks
+    assert given.plugin.path == Path("y.csv")
+
+
+class Level(Stage):
+    def process(self, frame: RgbdFrame) -> Mask:
+        return Mask(frame.color[..., 0] >= self.level)
+
+
+class Doubled(Level):
+    level: int = 1
+
+    @computed_field
+    @property
+    def double(self) -> int:
+        return 2 * self.level
+
+
+class Encoded(Level):
+    level: Json[int] = "1"
+
+
+class Renamed(Level):
+    level: int = Field(1, alias="grey")
+
+
+class TwoNames(Level):
+    model_config = ConfigDict(populate_by_name=True)
+    level: int = Field(1, alias="grey")
+
+
+@pytest.mark.parametrize(
+    ("plugin", "text"),
+    [
+        (Doubled, "level: 2"),
+        (Encoded, "level: '2'"),
+        (Renamed, "grey: 2"),
+        (TwoNames, "grey: 2"),
+        (TwoNames, "level: 2"),
+    ],
+)
+def test_settings_of_any_kind_are_the_same_when_written_and_read(lab: Lab, plugin, text):
+    lab.registry.stage("level", plugin)
+    plan = lab.compile(stage(f"{{use: level, {text}}}"))
+    assert plan.stages[0].plugin.level == 2
+    again = lab.compile(yaml.safe_dump(plan.resolved()))
+    assert again.stages[0].plugin == plan.stages[0].plugin
+    assert again.resolved() == plan.resolved()
+
+
+class ReadByName(Level):
+    level: int = Field(1, validation_alias="grey")
+
+
+class WrittenByName(Level):
+    level: int = Field(1, serialization_alias="grey")
+
+
+class Halved(Level):
+    level: Annotated[float, AfterValidator(lambda value: value / 2)]
+
+
+class Computed(Level):
+    model_config = ConfigDict(arbitrary_types_allowed=True)
+    level: int = 1
+    kernel: np.ndarray = np.ones(3)
+
+
+@pytest.mark.parametrize(
+    ("plugin", "setting", "fault"),
+    [
+        (ReadByName, "grey: 2", "'level' is a name for writing alone; an 'alias' is one for both"),
+        (WrittenByName, "level: 2", "'grey' is a name for writing alone"),
+        (Halved, "level: 2", "level is 1.0 when written, and then read as 0.5"),
+        (Computed, "level: 2", "Unable to serialize unknown type: <class 'numpy.ndarray'>"),
+    ],
+)
+def test_settings_that_a_manifest_could_not_hold_are_refused(lab: Lab, plugin, setting, fault):
+    lab.registry.stage("level", plugin)
+    expected = "graph.yaml:4:14: the settings of 'level' cannot be written into a graph and read "
+    text = lab.faults(stage(f"{{use: level, {setting}}}"))
+    assert text.startswith(f"{expected}again: {fault}")
 
 
 def test_a_fault_at_the_top_does_not_hide_the_faults_below() -> None:

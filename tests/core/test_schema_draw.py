@@ -4,12 +4,16 @@ import re
 from pathlib import Path
 
 import jsonschema
+import numpy as np
 import pytest
 import yaml
+from pydantic import ConfigDict, Field
 
+from mushpipe import Mask, RgbdFrame, Stage
 from mushpipe.core.draw import dot, mermaid
 from mushpipe.core.plugins import load_registry
 from mushpipe.core.schema import graph_schema
+from mushpipe.info import describe_plugin
 from tests.core.lab import Lab
 from tests.core.test_graph import GOOD
 
@@ -73,6 +77,26 @@ def test_plugins_that_cannot_be_imported_are_left_out(lab: Lab):
     names = schema["properties"]["stages"]["additionalProperties"]["properties"]["use"]["anyOf"][0]
     assert "broken" not in names["enum"]
     assert "threshold" in names["enum"]
+
+
+def test_a_setting_that_json_has_no_word_for_may_be_anything(lab: Lab):
+    class Fine(Stage):
+        model_config = ConfigDict(arbitrary_types_allowed=True)
+        kernel: np.ndarray | None = Field(None, description="made by the stage")
+        level: int = Field(1, ge=0, description="gray level")
+
+        def process(self, frame: RgbdFrame) -> Mask: ...
+
+    lab.registry.stage("fine", Fine)
+    graph = lab.chain("fine")
+    check(lab, graph)
+    with pytest.raises(jsonschema.ValidationError, match="less than the minimum of 0"):
+        check(lab, graph.replace("fine}", "fine, level: -1}"))
+    described = describe_plugin(lab.registry, "fine").splitlines()
+    assert [line.split() for line in described[-2:]] == [
+        ["kernel", "any", "|", "null", "null", "made", "by", "the", "stage"],
+        ["level", "integer", ">=", "0", "1", "gray", "level"],
+    ]
 
 
 def test_mermaid(lab: Lab):
