@@ -7,6 +7,7 @@ from pathlib import Path
 
 from mushpipe.core.plan import Node, Plan
 from mushpipe.core.plugins import in_file
+from mushpipe.core.stage import Sink
 from mushpipe.core.types import Trace
 
 _SHAPES = {"source": ("([", "])"), "stage": ("[", "]"), "sink": ("[/", "/]")}
@@ -28,8 +29,12 @@ def _edges(plan: Plan) -> Iterator[tuple[str, str, str]]:
             yield (plan.source, *plan.stages)[-1].name, node.name, _EVERYTHING
 
 
-def _text(plan: Plan, node: Node) -> tuple[str, str]:
-    delivery = f", {plan.delivery(node)}" if node.kind == "sink" else ""
+def _text(node: Node) -> tuple[str, str]:
+    """Return a node's name, and what it is; a sink with its delivery under a camera.
+
+    Whether the source is one shows when it is open.
+    """
+    delivery = f", {node.delivery or node.plugin.delivery}" if isinstance(node.plugin, Sink) else ""
     use = Path(node.use).name if in_file(node.use) else node.use  # alike in every folder
     return node.name, f"{use}{delivery}"
 
@@ -40,7 +45,7 @@ def mermaid(plan: Plan) -> str:
     lines = ["flowchart TD"]
     for node in _nodes(plan):
         begin, end = _SHAPES[node.kind]
-        name, detail = _text(plan, node)
+        name, detail = _text(node)
         lines.append(f'  {ids[node.name]}{begin}"{name}<br/><small>{detail}</small>"{end}')
     for producer, consumer, label in _edges(plan):
         arrow = f"{'-.->' if label == _EVERYTHING else '-->'}|{label}|"
@@ -52,7 +57,7 @@ def dot(plan: Plan) -> str:
     """Return a Graphviz digraph, edges labelled with port types."""
     lines = ["digraph mushpipe {"]
     for node in _nodes(plan):
-        name, detail = _text(plan, node)
+        name, detail = _text(node)
         label = f"{name}\\n{detail}".replace('"', '\\"')
         lines.append(f'  "{name}" [shape={_DOT_SHAPES[node.kind]}, label="{label}"];')
     for producer, consumer, label in _edges(plan):

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import jsonschema
 import numpy as np
@@ -14,7 +15,7 @@ from mushpipe.core.draw import dot, mermaid
 from mushpipe.core.plugins import load_registry
 from mushpipe.core.schema import graph_schema
 from mushpipe.info import describe_plugin
-from tests.core.lab import Lab
+from tests.core.lab import Frames, Lab
 from tests.core.test_graph import GOOD
 
 GRAPHS = sorted((Path(__file__).parents[2] / "graphs").glob("*.yaml"))
@@ -123,6 +124,20 @@ def test_dot(lab: Lab):
         '  "a" -> "out" [label="everything", style=dashed];\n'
         "}"
     )
+
+
+def test_drawing_asks_nothing_of_a_source_that_is_not_open(lab: Lab):
+    class Device(Frames):
+        _link: Any = None
+
+        @property
+        def live(self) -> bool:
+            return self._link.live
+
+    lab.registry.source("device", Device)
+    text = lab.chain("threshold", source="device")
+    assert "collect, every" in mermaid(lab.compile(text))
+    assert "collect, latest" in dot(lab.compile(text, "out.delivery=latest"))
 
 
 def test_the_second_output_is_labelled_with_its_own_type(lab: Lab):
