@@ -102,7 +102,7 @@ class RerunSink(Sink):
         """
         import rerun as rr
 
-        from mushpipe.sinks.rerun_style import log_start
+        from mushpipe.sinks.rerun_style import log_start, workspace_of
 
         sinks: list[Any] = []
         if self.save:
@@ -119,7 +119,7 @@ class RerunSink(Sink):
         self._memories = (Remembering(self._recording), Remembering(self._recording))
         graph = run.manifest.get("graph", {})
         self._base = base_of(graph)
-        log_start(self._recording, _workspace(graph), self._base)
+        log_start(self._recording, workspace_of(graph), self._base)
         image_hz = self.image_hz or (LIVE_IMAGE_HZ if run.live else None)
         self._period_ns = round(1e9 / image_hz) if image_hz else 0
         self._notes = _Notes()
@@ -244,14 +244,6 @@ class _Notes(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         self.waiting.append(record)
-
-
-def _workspace(graph: Any) -> tuple[Any, Any] | None:
-    """Return the corners of a robot's workspace, which is in the frame of the picks."""
-    for sink in graph.get("sinks", {}).values():
-        if sink.get("workspace"):
-            return sink["workspace"]["low"], sink["workspace"]["high"]
-    return None
 
 
 def _reached_at(host: str) -> str:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from itertools import cycle
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from mushpipe.core.scene import CYAN, GREEN
 from mushpipe.core.transform import Transform
+from mushpipe.robot.targets import Workspace
 from mushpipe.sinks import rerun_layout as at
 
 _WHEEL = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (213, 94, 0),
@@ -44,6 +47,15 @@ def log_start(rec: Any, box: tuple[Any, Any] | None, base: Transform | None) -> 
         low, high = np.array(box)
         shown = rr.Boxes3D(mins=[low], sizes=[high - low], colors=_WHITE, labels=["workspace"])
         rec.log(f"{place}/{at.WORKSPACE}", shown, static=True)
+
+
+def workspace_of(graph: Mapping[str, Any]) -> tuple[Any, Any] | None:
+    """Return the corners of a robot's workspace, which is in the frame of the picks."""
+    for sink in graph.get("sinks", {}).values():
+        with suppress(ValidationError):  # another plugin's setting of that name, or None
+            box = Workspace.model_validate(sink.get("workspace"))
+            return box.low, box.high
+    return None
 
 
 def log_layers(rec: Any, layers: Sequence[str], stages: Sequence[str]) -> None:

@@ -300,7 +300,8 @@ def test_images_go_on_after_a_stamp_that_leaps(tmp_path: Path) -> None:
 
 def test_the_workspace_of_a_robot_in_the_cameras_frame_is_drawn(tmp_path: Path) -> None:
     box = {"low": [-0.2, -0.1, 0.3], "high": [0.2, 0.1, 0.7]}
-    graph = {"stages": {}, "sinks": {"robot": {"workspace": box}}}
+    sinks = {"other": {"workspace": "cell 5"}, "next": {"workspace": {"low": 1, "high": 2}}}
+    graph = {"stages": {}, "sinks": {**sinks, "robot": {"workspace": box}}}
     found = show(tmp_path, [trace_of(make_frame())], graph=graph)
     np.testing.assert_allclose(values(found, "/camera/workspace", "centers"), [[[0, 0, 0.5]]])
     sizes = values(found, "/camera/workspace", "half_sizes")
