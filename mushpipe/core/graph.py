@@ -128,7 +128,8 @@ def _entries(document: Document) -> dict[Kind, list[tuple[Location, dict[str, An
 
 
 def _replace_source(document: Document, source: str, registry: Registry) -> None:
-    is_name = ("source", source) in registry.entries and not Path(source).exists()
+    name = source.rpartition(":")[2]  # which may say whose it is
+    is_name = ("source", name) in registry.entries and not Path(source).is_file()
     given = {"use": "mcap", "path": source}
     if source == "-":
         given = {"use": "stream"}

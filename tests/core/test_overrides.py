@@ -200,6 +200,22 @@ def test_source_names_a_recording_or_a_plugin(lab: Lab):
     assert lab.compile(GRAPH, source="frames").source.use == "frames"
 
 
+def test_a_folder_with_the_name_of_a_source_is_no_recording(lab: Lab, monkeypatch):
+    monkeypatch.chdir(lab.folder)
+    lab.registry.source("mcap", "mushpipe.sources.mcap:McapSource")
+    Path("frames").mkdir()
+    assert lab.compile(GRAPH, source="frames").source.use == "frames"
+    Path("frames").rmdir()
+    Path("frames").write_bytes(b"")
+    assert str(lab.compile(GRAPH, source="frames").source.plugin.path) == "frames"
+
+
+def test_source_may_say_whose_plugin_is_meant(lab: Lab):
+    assert lab.compile(GRAPH, source="this process:frames").source.use == "this process:frames"
+    text = lab.faults(GRAPH, source="another:frames")
+    assert text.startswith("--source another:frames: unknown source 'another:frames'")
+
+
 def test_source_keeps_the_settings_of_the_same_plugin(lab: Lab):
     graph = GRAPH.replace("{use: frames}", "{use: frames, count: 9}")
     assert lab.compile(graph, source="frames").source.plugin.count == 9
