@@ -14,6 +14,8 @@ import numpy as np
 from mushpipe.core.errors import PluginError
 from mushpipe.core.settings import WORDS, settings_of
 from mushpipe.core.stage import Kind, Plugin, Source, kind_of
+from mushpipe.core.table_type import table_fault
+from mushpipe.core.tables import Columns
 from mushpipe.core.truth import BUILT_IN
 from mushpipe.core.types import Mask, RgbdFrame
 
@@ -131,5 +133,9 @@ def _outputs(plugin: type[Plugin], hints: dict[str, Any]) -> tuple[type, ...]:
             raise PluginError(
                 f"{plugin.__qualname__}.process returns a type '{output.__name__}' that is not "
                 f"mushpipe's: import mushpipe.{output.__name__}, or give your own another name"
+            )
+        if issubclass(output, Columns) and (fault := table_fault(output)):
+            raise PluginError(
+                f"{plugin.__qualname__}.process returns {output.__name__}, which {fault}"
             )
     return outputs

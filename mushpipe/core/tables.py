@@ -77,10 +77,11 @@ class Columns:
 
     @classmethod
     def unknown(cls, n: int, **known: Any) -> Self:
-        """Return n rows of which only the given fields are known: NaN, 0 or False elsewhere."""
+        """Return n rows of which only the given fields are known: NaN, 0, False or "" elsewhere."""
         blank = {}
         for name, (shape, dtype) in cls._columns().items():
-            blank[name] = np.full((n, *shape), np.nan if dtype.kind == "f" else 0, dtype)
+            value = {"f": np.nan, "U": ""}.get(dtype.kind, 0)
+            blank[name] = np.full((n, *shape), value, dtype)
         return cls(**{**blank, **known})
 
     def take(self, rows: NDArray[Any]) -> Self:

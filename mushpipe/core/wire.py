@@ -37,6 +37,15 @@ DISTORTION_MODELS = {
     "inverse_brown_conrady": "inverse_brown_conrady",
     "rational": "rational_polynomial",
 }
+# how the schema of a table calls what NumPy calls by these kinds, and fields by these annotations
+JSON_KINDS = {
+    "f": ["number", "null"],
+    "b": "boolean",
+    "i": "integer",
+    "u": "integer",
+    "U": "string",
+}
+_PLAIN = {"str": "string", "bool": "boolean", "int": "integer", "float": ["number", "null"]}
 TABLES = {f"mushpipe.{cls.__name__}": cls for cls in BUILT_IN}
 
 
@@ -193,6 +202,9 @@ def _encode_instances(instances: Instances, header: Header) -> Iterator[Message]
 
 def _encode_table(table: Columns, header: Header) -> Iterator[Message]:
     columns = {f.name: getattr(table, f.name) for f in fields(table)}  # type: ignore[arg-type]
+    for name, value in columns.items():
+        if isinstance(value, np.ndarray) and value.dtype.kind == "U":  # orjson knows numbers alone
+            columns[name] = value.tolist()
     yield json_message(table_schema(type(table)), header, columns)
 
 
@@ -237,11 +249,10 @@ def table_schema(table: type[Columns]) -> Schema:
     properties: dict[str, Any] = {}
     for item in fields(table):  # type: ignore[arg-type]
         if "shape" not in item.metadata:
-            properties[item.name] = {"type": "string"}
+            plain = _PLAIN.get(str(getattr(item.type, "__name__", item.type)))
+            properties[item.name] = {"type": plain} if plain else {}  # else anything
             continue
-        number = np.issubdtype(item.metadata["dtype"], np.floating)
-        kind = "boolean" if item.metadata["dtype"] is np.bool_ else "integer"
-        entry: dict[str, Any] = {"type": ["number", "null"] if number else kind}
+        entry: dict[str, Any] = {"type": JSON_KINDS[np.dtype(item.metadata["dtype"]).kind]}
         for length in reversed(item.metadata["shape"]):
             entry = {"type": "array", "items": entry, "minItems": length, "maxItems": length}
         properties[item.name] = {"type": "array", "items": entry}

@@ -1,6 +1,7 @@
 """What is written, read back by MCAP's own library, protobuf, json and jsonschema."""
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -9,8 +10,9 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
+from numpy.typing import NDArray
 
-from mushpipe import Camera, Header, Mask, RgbdFrame
+from mushpipe import Camera, Columns, Header, Mask, RgbdFrame, column
 from mushpipe.core import wire
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.recording import RecordingReader
@@ -149,6 +151,43 @@ def test_a_table_is_json_that_fits_its_schema_and_loses_nothing(written, table):
     assert decoded.header == HEADER
     for name, value in vars(table).items():
         np.testing.assert_array_equal(getattr(decoded.table, name), value)
+
+
+@dataclass(frozen=True, eq=False)
+class Ripeness(Columns):
+    stage: NDArray[np.str_] = column(dtype=str)
+    spots: NDArray[np.str_] = column(2, dtype=str)
+    ripe: NDArray[np.bool_] = column(dtype=bool)
+    share: NDArray[np.float16] = column(dtype=np.float16)
+    bed: str = "A"
+    temperature: float = np.nan
+    watered: bool = True
+    row: "int" = 3
+    limits: tuple[float, float] | None = None
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        Ripeness(["bud", "ripe"], [["", "brown"], ["a", "b"]], [False, True], [np.nan, 0.5]),
+        Ripeness.unknown(2, limits=(1.0, 2.0)),
+        Ripeness([], [], [], []),
+    ],
+)
+def test_a_table_of_ones_own_fits_its_schema(written, table):
+    _, schema, _, body = written(lambda w: w.value("/t", table, HEADER))[0]
+    described = json.loads(schema.data)
+    jsonschema.validate(body, described)
+    for name in ("stage", "spots", "ripe"):
+        assert body[name] == getattr(table, name).tolist()
+    assert body["temperature"] is None
+    assert (body["bed"], body["watered"], body["row"]) == ("A", True, 3)
+    kinds = {name: part.get("type") for name, part in described["properties"].items()}
+    assert kinds["bed"] == "string"
+    assert kinds["temperature"] == ["number", "null"]
+    assert kinds["watered"] == "boolean"
+    assert kinds["row"] == "integer"
+    assert described["properties"]["ripe"]["items"] == {"type": "boolean"}
 
 
 def test_floats_are_exact_in_json(written):

@@ -1,6 +1,7 @@
 """Ports read from signatures, and who feeds whom."""
 
 import typing
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from mushpipe import (
     Sink,
     Stage,
     Trace,
+    column,
 )
 from mushpipe.core.errors import PluginError
 from mushpipe.core.plan import Link
@@ -134,6 +136,50 @@ def consume_dice(self, rng: np.random.Generator) -> None: ...
 def test_a_sink_that_could_not_be_called(consume, message):
     with pytest.raises(PluginError, match=f"^{message}"):
         ports_of(type("Declared", (Sink,), {"consume": consume}))
+
+
+def table(decorated: bool = True, base: type = Columns, **columns: Any) -> type:
+    """Return a type `Table` with fields; those that are no columns are text."""
+    hints = {name: str if value == "" else np.ndarray for name, value in columns.items()}
+    made = type("Table", (base,), {"__annotations__": hints, **columns})
+    return dataclass(frozen=True, eq=False)(made) if decorated else made
+
+
+@pytest.mark.parametrize(
+    ("made", "fault"),
+    [
+        (table(sequence=column()), "has a field 'sequence', where a recording has that of the"),
+        (table(a=column(), timestamp=""), "has a field 'timestamp', where a recording has that"),
+        (table(frame_id=column(dtype=int)), "has a field 'frame_id', where a recording has that"),
+        (table(a=column(dtype=object)), "has a column 'a' of object, which is not recorded"),
+        (table(a=column(dtype=complex)), "has a column 'a' of complex128, which is not recorded"),
+        (table(a=column(dtype="U3")), "has a column 'a' of <U3, which is not recorded"),
+        (table(a=column(dtype="datetime64[ns]")), "has a column 'a' of datetime64"),
+        (table(a=""), r"has no column: declare its fields by column\(\)"),
+        (table(a=column(), decorated=False), "is no dataclass: write @dataclass"),
+        (table(a=column(), base=Circles, decorated=False), "is no dataclass: write @dataclass"),
+    ],
+)
+def test_a_table_that_could_not_be_recorded(made: type, fault: str):
+    def process(self, frame: RgbdFrame) -> made: ...
+
+    with pytest.raises(PluginError, match=f"^Declared.process returns Table, which {fault}"):
+        ports_of(declared(process))
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        table(a=column(dtype=str), frame_id=""),
+        table(a=column(3, dtype=bool), b=column(dtype=np.uint8)),
+        table(a=column(), base=Circles),
+        type("Table", (Circles,), {}),
+    ],
+)
+def test_a_table_that_can_be_recorded(made: type):
+    def process(self, frame: RgbdFrame) -> made: ...
+
+    assert ports_of(declared(process)).outputs == (made,)
 
 
 @pytest.mark.parametrize("word", ["use", "inputs", "delivery"])
