@@ -28,14 +28,25 @@ def write_capsule(folder: Path, plan: Plan, node: Node, frame: RgbdFrame, messag
     name = source.name() if isinstance(source, Source) else ""
     number = frame.header.sequence if plan.replay() else frame.header.stamp_ns
     path = folder / f"failure-{name}-{node.name}-{number}.mcap"
-    sinks = tuple(sink for sink in plan.sinks if sink.name == node.name)
-    kept = replace(plan, sinks=sinks, on_error="fail")  # one frame: skipping it would show nothing
+    kept = replace(
+        plan,
+        stages=tuple(map(_anchored, plan.stages)),
+        sinks=tuple(_anchored(sink) for sink in plan.sinks if sink.name == node.name),
+        on_error="fail",  # one frame: skipping it would show nothing
+    )
     kept = kept.into(path.absolute().with_suffix(".out"))
     metadata = {GRAPH: {"json": json.dumps(kept.resolved()), "failure": message}}
     writer = RecordingWriter(path, metadata)
     writer.frame(frame)
     writer.close()
     return path
+
+
+def _anchored(node: Node) -> Node:
+    """Return a node that reads the files it reads now, wherever its graph stands."""
+    read = node.plugin.path_settings(written=False)
+    here = {name: path.absolute() for name, path in read.items()}
+    return replace(node, plugin=node.plugin.model_copy(update=here))
 
 
 def capsule_document(path: Path) -> Document:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mushpipe import Camera, Circles, RgbdFrame, Sink, SinkPath, Stage
+from mushpipe import Camera, Circles, GraphPath, Mask, RgbdFrame, Sink, SinkPath, Stage
 from mushpipe.core.capsule import capsule_document
 from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.graph import compile_document
@@ -79,6 +79,21 @@ def test_a_capsule_keeps_the_resolved_graph_without_its_sinks(lab: Lab, graph: s
     assert document.data["source"] == {"use": "mcap", "path": report.capsules[0]}
     assert document.data["stages"]["a"] == {"use": "threshold", "level": 2, "band": None}
     assert (document.data["seed"], document.data["sinks"]) == (3, {})
+
+
+def test_a_capsule_reads_the_files_that_the_shell_named(lab: Lab, monkeypatch):
+    class Reader(Stage):
+        file: GraphPath
+
+        def process(self, frame: RgbdFrame) -> Mask:
+            raise RuntimeError(self.file.read_text())
+
+    monkeypatch.chdir(lab.folder)
+    Path("words.txt").write_text("so it says")
+    lab.registry.source("mcap", "mushpipe.sources.mcap:McapSource")
+    report = lab.run(lab.chain(Reader), "a.file=words.txt", capsules=lab.folder / "failures")
+    monkeypatch.chdir("/")
+    assert str(again(lab, report.capsules[0]).error).endswith("RuntimeError: so it says")
 
 
 def test_a_capsule_of_a_skipping_run_does_not_skip(lab: Lab, graph: str):
