@@ -51,7 +51,8 @@ def ports_of(plugin: type[Plugin]) -> Ports:
 
     Raises:
         PluginError: The method is missing or cannot be called frame by frame, an annotation is
-            missing or not a class, or a setting has a name that a graph could not set.
+            missing or not a class, a setting has a name that a graph could not set, or what it
+            returns could not be recorded.
     """
     for name in settings_of(plugin):
         if name in WORDS:
@@ -59,6 +60,11 @@ def ports_of(plugin: type[Plugin]) -> Ports:
                 f"{plugin.__qualname__}: a setting cannot be called '{name}', which in a graph "
                 "stands beside the settings; give it another name, or an alias"
             )
+    if plugin.__pydantic_custom_init__:
+        raise PluginError(
+            f"{plugin.__qualname__} has an __init__, without which a run makes its copy: set state "
+            "up in open(), or give private attributes a default"
+        )
     kind = kind_of(plugin)
     method, parameters = _method(plugin, kind)
     if kind == "source":

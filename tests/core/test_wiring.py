@@ -196,6 +196,20 @@ def test_a_setting_that_a_graph_could_not_set(lab: Lab, word: str):
     assert f"Greedy: a setting cannot be called '{word}', which in a graph stands" in fault
 
 
+def test_state_made_by_a_constructor_is_refused():
+    class Eager(Stage):
+        _size: int
+
+        def __init__(self, **settings: Any) -> None:
+            super().__init__(**settings)
+            self._size = 3
+
+        def process(self, frame: RgbdFrame) -> Mask: ...
+
+    with pytest.raises(PluginError, match="Eager has an __init__, without which a run makes its"):
+        ports_of(Eager)
+
+
 def test_a_plugin_without_its_method():
     with pytest.raises(PluginError, match=r"^Stage has no method 'process'$"):
         ports_of(Stage)
