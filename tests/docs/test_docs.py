@@ -7,6 +7,8 @@ import runpy
 import shlex
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import yaml
 from typer.testing import CliRunner
@@ -16,6 +18,7 @@ from mushpipe.cli import app
 from mushpipe.core.document import read_document
 from mushpipe.core.graph import compile_document
 from mushpipe.core.plugins import Registry, load_registry
+from mushpipe.core.run import run
 from mushpipe.core.stage import Kind
 from mushpipe.info import settings_rows
 from tests.docs.consoles import BLOCK, PAGES, renewed
@@ -84,6 +87,35 @@ def test_the_graph_and_the_segmenter_of_the_docs_work(tmp_path: Path) -> None:
     assert type(plan.stages[0].plugin).__name__ == "Bright"
 
 
+def test_the_plugins_of_the_docs_work(tmp_path: Path) -> None:
+    page = Path("docs/plugins.md").read_text()
+    code = "\n".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL))
+    (tmp_path / "mine.py").write_text(code)
+    (tmp_path / "shots").mkdir()
+    picture = np.zeros((60, 80, 3), np.uint8)
+    cv2.circle(picture, (30, 20), 9, (255, 255, 255), -1)
+    for number in range(2):
+        cv2.imwrite(str(tmp_path / f"shots/{number}.png"), picture)
+    (tmp_path / "graph.yaml").write_text("""
+mushpipe: 1
+source: {use: ./mine.py:Pictures, folder: shots}
+stages:
+  segment: {use: otsu}
+  blobs: {use: ./mine.py:Blobs}
+  ripe: {use: ./mine.py:Ripe}
+sinks:
+  count: {use: ./mine.py:Counts, path: "{recording}.txt"}
+  log: {use: mcap, path: log.mcap}
+""")
+    plan = compile_document(read_document(tmp_path / "graph.yaml"), load_registry())
+    assert run(plan).error is None
+    assert (tmp_path / "pictures.txt").read_text() == "0,1\n1,1\n"
+    mine = runpy.run_path(str(tmp_path / "mine.py"))
+    assert len(mine["circles"]) > 1
+    (first, _) = mine["rows"](tmp_path / "log.mcap", "/mushpipe/ripe")
+    assert (first["share"], first["grade"]) == ([None], [""])
+
+
 def test_changed_settings_in_the_docs_are_accepted(tmp_path: Path) -> None:
     """Commands with `--set` compile, but for those on files or devices of the reader."""
     runs = [
@@ -97,10 +129,10 @@ def test_changed_settings_in_the_docs_are_accepted(tmp_path: Path) -> None:
         r"```python\n(.*?)```", Path("docs/tutorial.md").read_text(), re.DOTALL
     )
     (tmp_path / "mine.py").write_text(segmenter)
-    for run in tried:
-        arguments = [word.replace("./mine.py", str(tmp_path / "mine.py")) for word in run[1:]]
+    for command in tried:
+        arguments = [word.replace("./mine.py", str(tmp_path / "mine.py")) for word in command[1:]]
         result = CliRunner().invoke(app, ["validate", *arguments])
-        assert result.exit_code == 0, (run, result.exception)
+        assert result.exit_code == 0, (command, result.exception)
 
 
 def test_links_to_files_of_the_repository_lead_somewhere() -> None:
