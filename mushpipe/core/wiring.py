@@ -7,8 +7,10 @@ from mushpipe.core.errors import MushpipeError, Problem, suggest
 from mushpipe.core.plan import Link, Node
 from mushpipe.core.plugins import Registry
 from mushpipe.core.ports import Port, ports_of
-from mushpipe.core.tables import Circles, Locations, Poses
+from mushpipe.core.tables import Circles, Columns, Locations, Poses
 from mushpipe.core.types import Trace
+
+_SHARE = "plugins share a type that they import from one package, or define in one file"
 
 
 def wire(document: Document, registry: Registry, nodes: list[Node]) -> list[Problem]:
@@ -17,7 +19,7 @@ def wire(document: Document, registry: Registry, nodes: list[Node]) -> list[Prob
     An output that nobody takes becomes a warning of the document, and so do locations or poses
     that are of other circles than those they come together with.
     """
-    problems: list[Problem] = []
+    problems = _check_names(document, nodes)
     for position, node in enumerate(nodes):
         above = [other for other in nodes[:position] if other.kind != "sink"]
         unknown = node.asked.keys() - {port.name for port in node.ports.inputs}
@@ -62,7 +64,29 @@ def _connect(
     if not port.required and port.name not in node.plugin.required_inputs():
         return None
     message = f"nothing above '{node.name}' produces the {port.type.__name__} of its '{port.name}'"
-    return document.problem(at, message, _who_produces(registry, port), key=True)
+    hint = _namesake(port, above) or _who_produces(registry, port)
+    return document.problem(at, message, hint, key=True)
+
+
+def _check_names(document: Document, nodes: list[Node]) -> list[Problem]:
+    """Return which tables have the name of another's, under whose schema they would be recorded."""
+    problems = []
+    made: dict[str, tuple[type, str]] = {}
+    for node in nodes:
+        for kind in node.ports.outputs:
+            first, maker = made.setdefault(kind.__name__, (kind, node.name))
+            if kind is not first and issubclass(kind, Columns):
+                message = f"the {kind.__name__} of '{node.name}' is another type than '{maker}' has"
+                problems.append(document.problem(_place(node), message, _SHARE, key=True))
+    return problems
+
+
+def _namesake(port: Port, above: list[Node]) -> str:
+    """Return a hint where another type has the name of one that is missing."""
+    for node in above:
+        if any(kind.__name__ == port.type.__name__ for kind in node.ports.outputs):
+            return f"'{node.name}' has another type of that name: {_SHARE}"
+    return ""
 
 
 def _place(node: Node) -> Location:

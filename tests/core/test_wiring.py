@@ -437,6 +437,28 @@ def test_all_inputs_that_cannot_be_wired_are_reported_together(lab: Lab):
     assert text.count("nothing above") == 2
 
 
+def finds(made: type) -> type[Stage]:
+    def process(self, frame: RgbdFrame) -> made: ...
+
+    return declared(process)
+
+
+def test_two_tables_of_one_name_are_told_apart(lab: Lab):
+    one, other = table(a=column()), table(b=column())
+
+    class Take(Sink):
+        def consume(self, found: one) -> None: ...
+
+    lab.registry.sink("take", Take)
+    shared = "    plugins share a type that they import from one package, or define in one file"
+    said = "graph.yaml:6:3: the Table of 'b' is another type than 'a' has\n      b: {use: own-b}\n"
+    assert lab.faults(lab.chain(finds(one), finds(other))) == f"{said}      ^\n{shared}"
+    assert lab.compile(lab.chain(finds(one), finds(one))).stages
+    fault = lab.faults(lab.chain(finds(other)).replace("collect", "take"))
+    assert "nothing above 'out' produces the Table of its 'found'" in fault
+    assert fault.endswith(f"'a' has another type of that name: {shared.strip()}")
+
+
 def test_a_type_that_no_plugin_produces(lab: Lab):
     class Robot(Sink):
         def consume(self, picks: Picks) -> None: ...
