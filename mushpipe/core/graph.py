@@ -244,8 +244,7 @@ def _node(
     except ValidationError as error:
         problems += faults_of(document, at, error, plugin_class, use)
         # never run, but its ports say whether it is wired
-        unset = plugin_class.model_construct()
-        return Node(str(at[-1]), kind, use, unset, ports, dict(inputs), delivery)
+        return Node(str(at[-1]), kind, use, Plugin(), ports, dict(inputs), delivery)
     if fault := writing_fault(plugin):
         message = f"the settings of '{use}' cannot be written into a graph and read again: {fault}"
         problems.append(document.problem((*at, "use"), message))

@@ -13,7 +13,7 @@ import numpy as np
 
 from mushpipe.core.errors import PluginError
 from mushpipe.core.settings import WORDS, settings_of
-from mushpipe.core.stage import Kind, Plugin, Source, kind_of
+from mushpipe.core.stage import Kind, Plugin, Sink, Source, Stage, kind_of
 from mushpipe.core.table_type import table_fault
 from mushpipe.core.tables import Columns
 from mushpipe.core.truth import BUILT_IN
@@ -22,6 +22,7 @@ from mushpipe.core.types import Mask, RgbdFrame
 # Values are recorded under the names of their types.
 _TAKEN: dict[str, type] = {t.__name__: t for t in (*BUILT_IN, Mask, RgbdFrame)}
 _METHODS: dict[Kind, str] = {"stage": "process", "source": "frames", "sink": "consume"}
+_BASES: dict[Kind, type[Plugin]] = {"stage": Stage, "source": Source, "sink": Sink}
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,7 @@ def ports_of(plugin: type[Plugin]) -> Ports:
             "up in open(), or give private attributes a default"
         )
     kind = kind_of(plugin)
+    _check_calls(plugin, kind)
     method, parameters = _method(plugin, kind)
     if kind == "source":
         return OF_SOURCE
@@ -84,6 +86,26 @@ def ports_of(plugin: type[Plugin]) -> Ports:
     inputs = tuple(port for port in ports if port.name not in random)
     outputs = _outputs(plugin, hints) if kind == "stage" else ()
     return Ports(inputs, outputs, random[0] if random else None)
+
+
+def _check_calls(plugin: type[Plugin], kind: Kind) -> None:
+    """Raise PluginError where a run could not call a method as it calls that of the base."""
+    for name, base in inspect.getmembers(_BASES[kind], inspect.isfunction):
+        if base.__module__ != Plugin.__module__ or name.startswith("_"):  # pydantic's own
+            continue
+        if name in plugin.model_fields:
+            raise PluginError(
+                f"{plugin.__qualname__}: a setting cannot be called '{name}', as a method of every "
+                f"{kind} is: call it '{name}_', with the alias '{name}'"
+            )
+        expected = list(inspect.signature(base).parameters)
+        unbound = not isinstance(inspect.getattr_static(plugin, name), staticmethod | classmethod)
+        try:
+            inspect.signature(getattr(plugin, name)).bind(*expected[not unbound :])
+        except TypeError:
+            raise PluginError(
+                f"{plugin.__qualname__}.{name} must be a method that takes ({', '.join(expected)})"
+            ) from None
 
 
 def _method(plugin: type[Plugin], kind: Kind) -> tuple[Any, list[Parameter]]:

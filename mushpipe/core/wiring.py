@@ -61,8 +61,12 @@ def _connect(
     if wanted is not None:
         message = _why_not(node, port, wanted, above, nodes)
         return document.problem((*at, "inputs", port.name), message)
-    if not port.required and port.name not in node.plugin.required_inputs():
-        return None
+    try:
+        if not port.required and port.name not in node.plugin.required_inputs():
+            return None
+    except Exception as error:  # of a plugin
+        message = f"'{node.use}': its required_inputs() failed: {type(error).__name__}: {error}"
+        return document.problem(at, message, key=True)
     message = f"nothing above '{node.name}' produces the {port.type.__name__} of its '{port.name}'"
     hint = _namesake(port, above) or _who_produces(registry, port)
     return document.problem(at, message, hint, key=True)

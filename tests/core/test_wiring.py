@@ -2,7 +2,7 @@
 
 import typing
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -15,6 +15,7 @@ from mushpipe import (
     Picks,
     Poses,
     RgbdFrame,
+    RunInfo,
     Sink,
     Stage,
     Trace,
@@ -323,6 +324,87 @@ def test_a_setting_can_make_an_optional_input_a_required_one(lab: Lab):
     assert links(lab, text)["a"] == {"frame": Link("source", 0)}
     text = text.replace("a: {", "a: {needs_mask: true, ")
     assert "nothing above 'a' produces the Mask of its 'mask'" in lab.faults(text)
+
+
+def test_a_missing_setting_is_told_though_it_says_which_inputs_are_required(lab: Lab):
+    class Picky(Stage):
+        needs_mask: bool
+
+        def required_inputs(self) -> frozenset[str]:
+            return frozenset({"mask"} if self.needs_mask else ())
+
+        def process(self, frame: RgbdFrame, mask: Mask | None) -> Circles: ...
+
+    assert "setting 'needs_mask' of 'own-a' is missing" in lab.faults(lab.chain(Picky))
+
+
+def test_required_inputs_that_fail_are_a_fault(lab: Lab):
+    class Broken(Stage):
+        def required_inputs(self) -> frozenset[str]:
+            raise ValueError("no idea")
+
+        def process(self, frame: RgbdFrame, mask: Mask | None) -> Circles: ...
+
+    fault = lab.faults(lab.chain(Broken))
+    assert fault.startswith("graph.yaml:5:3: 'own-a': its required_inputs() failed: ValueError: no")
+
+
+class Called(Frames):
+    name: ClassVar[str] = "bed"
+
+
+class Known(Frames):
+    @property
+    def name(self) -> str:
+        return "bed"
+
+
+class Told(Invert):
+    def open(self, info: RunInfo) -> None: ...
+
+
+class Untold(Sink):
+    def open(self) -> None: ...
+    def consume(self, trace: Trace) -> None: ...
+
+
+@pytest.mark.parametrize(
+    ("plugin", "message"),
+    [
+        (Called, "name must be a method that takes (self)"),
+        (Known, "name must be a method that takes (self)"),
+        (Told, "open must be a method that takes (self)"),
+        (Untold, "open must be a method that takes (self, run)"),
+    ],
+)
+def test_what_a_run_calls_must_be_as_it_is_called(plugin, message):
+    with pytest.raises(PluginError) as caught:
+        ports_of(plugin)
+    assert message in str(caught.value)
+
+
+@pytest.mark.filterwarnings("ignore:Field name:UserWarning")
+def test_a_setting_with_the_name_of_a_method():
+    class Titled(Frames):
+        name: str = "bed"
+
+    with pytest.raises(PluginError, match="a setting cannot be called 'name', as a method of ever"):
+        ports_of(Titled)
+
+
+def test_what_a_run_calls_may_be_static_or_take_more():
+    class Easy(Frames):
+        @staticmethod
+        def name() -> str:
+            return "bed"
+
+        @classmethod
+        def describe(cls) -> dict[str, Any]:
+            return {}
+
+        def open(self, again: bool = False, *more: int) -> None: ...
+
+    assert ports_of(Easy).outputs == (RgbdFrame,)
 
 
 def test_what_was_found_in_other_circles_is_a_warning(lab: Lab):
