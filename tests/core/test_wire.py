@@ -93,13 +93,13 @@ def test_the_calibration_is_written_again_when_it_changes(written):
     other = Camera(8, 6, 20, 20, 3, 2)
 
     def act(writer: RecordingWriter) -> None:
-        for camera in (CAMERA, CAMERA, other, None):
+        for camera in (None, CAMERA, CAMERA, other, None, None):
             writer.frame(frame(camera=camera))
 
     rows = written(act)
     focal = [body.K[0] for channel, *_, body in rows if channel.topic == wire.CAMERA_TOPIC]
-    assert focal == [10, 20]
-    assert sum(channel.topic == wire.COLOR_TOPIC for channel, *_ in rows) == 4
+    assert focal == [0, 10, 20, 0]  # zeros, as in ROS, say that there is none
+    assert sum(channel.topic == wire.COLOR_TOPIC for channel, *_ in rows) == 6
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_colour_as_jpeg(written):
     smooth[..., 0] = np.arange(64)[:, None] * 4
     smooth[..., 2] = 50
     rows = written(lambda w: w.frame(RgbdFrame(HEADER, smooth), jpeg_quality=95))
-    _, schema, _, body = rows[0]
+    _, schema, _, body = rows[-1]
     assert (schema.name, body.format) == ("foxglove.CompressedImage", "jpeg")
     image = cv2.imdecode(np.frombuffer(body.data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
     np.testing.assert_allclose(image.astype(int), smooth, atol=12)
