@@ -21,6 +21,7 @@ _NOT_CAMERA = (RESULT_PREFIX, "/truth/")
 ALIGNED = "aligned_depth_to_color"
 # What parts of a topic say of the images, and not of the camera.
 _OF_IMAGES = re.compile("colou?r|rgb|depth|image|rect|registered|stereo|infra|compressed")
+_WORDS = {"depth": ("depth",), "infra": ("infra",), "color": ("color", "colour", "rgb")}
 _TRANSPORTS = ("/compressedDepth", "/compressed")
 
 
@@ -86,14 +87,25 @@ def _topics(index: Index, schemas: set[str]) -> list[str]:
     return [t for t in named if index.counts[t] and not t.startswith(_NOT_CAMERA)]
 
 
+def _kind(topic: str) -> str:
+    """Return what a topic says of its images: depth, infra, color or nothing.
+
+    Of its parts the last one that says something counts: the first may name a depth camera.
+    """
+    for part in reversed(_base(topic).lower().split("/")):
+        for kind, words in _WORDS.items():
+            if any(word in part for word in words):
+                return kind
+    return ""
+
+
 def _colors(images: list[str]) -> list[str]:
-    others = [t for t in images if "depth" not in t.lower() and "infra" not in t.lower()]
-    named = [t for t in others if "color" in t.lower() or "rgb" in t.lower()]
-    return _without_transports(named or others)
+    named = [t for t in images if _kind(t) == "color"]
+    return _without_transports(named or [t for t in images if not _kind(t)])
 
 
 def _depths(images: list[str]) -> list[str]:
-    depths = [t for t in images if "depth" in t.lower()]
+    depths = [t for t in images if _kind(t) == "depth"]
     aligned = [t for t in depths if ALIGNED in t.lower()]
     return _without_transports(aligned or depths)
 
@@ -112,7 +124,7 @@ def _base(topic: str) -> str:
 def _calibration(index: Index, path: Path, color: str) -> str | None:
     calibrations = _topics(index, CALIBRATIONS)
     beside = [t for t in calibrations if is_beside(t, color)]
-    others = [t for t in calibrations if "depth" not in t.lower() and "infra" not in t.lower()]
+    others = [t for t in calibrations if _kind(t) not in ("depth", "infra")]
     return _one(path, "camera", beside or others)
 
 

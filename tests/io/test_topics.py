@@ -54,7 +54,9 @@ def refusal(tmp_path: Path, entries: list[Entry], **settings: object) -> str:
     return str(error.value).removeprefix(f"{path}: ")
 
 
-@pytest.mark.parametrize("namespace", ["/camera/camera", "/camera", "", "/robot1/D405"])
+@pytest.mark.parametrize(
+    "namespace", ["/camera/camera", "/camera", "", "/robot1/D405", "/depth_camera", "/rgbd/infra"]
+)
 def test_names_of_old_and_new_nodes_are_known(namespace: str, tmp_path: Path) -> None:
     entries = [(t.replace("/camera/camera", namespace), at, m) for t, at, m in rgbd([0])]
     frame = first(tmp_path, entries)
