@@ -58,7 +58,7 @@ def _made(frame: RgbdFrame, last: RgbdFrame) -> Iterator[wire.Message]:
         return
     if frame.color is not last.color:
         yield wire.encode_color(frame)._replace(suffix="/color")
-    if frame.depth is not last.depth:
+    if frame.depth is not last.depth or frame.depth_scale != last.depth_scale:
         yield wire.encode_depth(frame)._replace(suffix="/depth")
 
 

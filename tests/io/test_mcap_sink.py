@@ -128,9 +128,12 @@ def test_only_images_that_a_stage_made_are_recorded(tmp_path: Path) -> None:
     frame = make_frame()
     bright = replace(frame, color=frame.color // 2 + 100)
     deep = replace(bright, depth=frame.depth + np.uint16(1))
-    trace = trace_of(frame, bright=bright, same=replace(bright), deep=deep)
-    topics = set(by_topic(record(tmp_path / "all.mcap", [trace])))
-    made = {"/mushpipe/bright/color", "/mushpipe/deep/depth"}
+    scaled = replace(deep, depth_scale=0.002)
+    trace = trace_of(frame, bright=bright, same=replace(bright), deep=deep, scaled=scaled)
+    topics = set(by_topic(path := record(tmp_path / "all.mcap", [trace])))
+    made = {"/mushpipe/bright/color", "/mushpipe/deep/depth", "/mushpipe/scaled/depth"}
+    (again,) = read_traces(path)
+    assert again.outputs["scaled"][0].depth_scale == 0.002
     assert topics == {COLOR, DEPTH, INFO, "/mushpipe/timing", *made}
     given = record(tmp_path / "given.mcap", [trace], frames="source")
     assert set(by_topic(given)) == topics - made
