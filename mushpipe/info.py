@@ -141,6 +141,8 @@ def _settings(schema: dict[str, Any], prefix: str = "") -> list[tuple[str, ...]]
     rows: list[tuple[str, ...]] = []
     for key, field in schema.get("properties", {}).items():
         group = schema.get("$defs", {}).get(field.get("$ref", "").rpartition("/")[2])
+        if group and "enum" in group:
+            field, group = {**group, **field}, None
         default = json.dumps(field["default"]) if "default" in field and not group else ""
         if key in schema.get("required", ()):
             default = "required"

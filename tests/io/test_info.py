@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from enum import Enum
 from pathlib import Path
 from typing import Literal
 
@@ -102,6 +103,11 @@ def test_no_recording_at_all_is_refused(content: bytes, tmp_path: Path) -> None:
         describe(path)
 
 
+class Side(Enum):
+    left = "left"
+    right = "right"
+
+
 class Threshold(Stage):
     """Calls bright what is brighter than a level.
 
@@ -111,6 +117,7 @@ class Threshold(Stage):
     level: float = Field(0.5, gt=0, le=1, description="share of white")
     band: tuple[int, int] = Field(description="rows, px")
     mode: Literal["fast", "exact"] = Field("fast", description="how")
+    side: Side = Field(Side.left, description="where")
 
     def process(self, frame: RgbdFrame, mask: Mask | None = None) -> tuple[Mask, Circles]:
         raise NotImplementedError
@@ -155,11 +162,12 @@ def test_every_plugin_of_a_name_is_described() -> None:
     assert "The level is a share of white." in lines
     assert "inputs   frame: RgbdFrame, mask: Mask (optional)" in lines
     assert "outputs  Mask, Circles" in lines
-    assert [re.split(r"  +", line) for line in lines[-4:]] == [
+    assert [re.split(r"  +", line) for line in lines[-5:]] == [
         ["setting", "type", "default", "meaning"],
         ["level", "number > 0 <= 1", "0.5", "share of white"],
         ["band", "[integer, integer]", "required", "rows, px"],
         ["mode", "fast | exact", '"fast"', "how"],
+        ["side", "left | right", '"left"', "where"],
     ]
     assert sink.splitlines()[-1] == "outputs  none"
 
