@@ -35,7 +35,8 @@ class DepthCorrect(Stage):
 
     @model_validator(mode="after")
     def _one_way(self) -> Self:
-        if self.calibration is not None and self.model_fields_set != {"calibration"}:
+        stated = self.offset_mm or self.slope_mm_per_m or self.curve_mm_per_m2
+        if self.calibration is not None and stated:
             raise ValueError("the errors stand either here or in the file of 'calibration'")
         return self
 

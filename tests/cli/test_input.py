@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mushpipe import Camera, Header, RgbdFrame
+from mushpipe.core import wire
 from mushpipe.core.errors import EXIT_DAMAGED, EXIT_OK
 from mushpipe.core.recorder import RecordingWriter
 from tests.cli.test_commands import GRAPH, mushpipe
@@ -24,7 +25,11 @@ def record(path: Path, shapes: list[tuple[int, int]], depth: bool, camera: Camer
         native = np.full((height, width), 500, np.uint16) if depth else None
         header = Header(10**9 + i * 33_000_000, i, "camera_color_optical_frame")
         fits = camera if (height, width) == (120, 160) else None
-        writer.frame(RgbdFrame(header, color, native, 0.001, fits))
+        frame = RgbdFrame(header, color, native, 0.001, fits)
+        if fits == camera:
+            writer.frame(frame)
+        else:  # a recorder that says nothing of another size
+            writer.write(wire.COLOR_TOPIC, wire.encode_color(frame), header)
     writer.close()
 
 
