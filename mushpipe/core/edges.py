@@ -23,6 +23,7 @@ from mushpipe.core.types import RgbdFrame
 logger = logging.getLogger("mushpipe")
 READ_AHEAD = 2
 SINK_QUEUE = 4
+LEAP_NS = 60 * 10**9
 
 
 def failure(node: Node, sequence: int | None, error: BaseException) -> StageError:
@@ -95,14 +96,24 @@ def limited(frames: Iterator[RgbdFrame], source: Source) -> Iterator[RgbdFrame]:
 
 
 def paced(frames: Iterator[RgbdFrame], speed: float, stop: threading.Event) -> Iterator[RgbdFrame]:
-    """Yield frames at their recorded pace times ``speed``; 0 does not wait."""
-    first: tuple[int, float] | None = None
+    """Yield frames at their recorded pace times ``speed``; 0 does not wait.
+
+    Where stamps go back, or leap by more than `LEAP_NS`, they are another clock's, and the pace
+    goes on from there.
+    """
+    first, last_ns = (0, 0.0), -math.inf
     for frame in frames:
-        if speed and first:
-            due = first[1] + (frame.header.stamp_ns - first[0]) / 1e9 / speed
+        stamp_ns = frame.header.stamp_ns
+        if not 0 <= stamp_ns - last_ns <= LEAP_NS:
+            first = stamp_ns, time.monotonic()
+            if speed and last_ns > -math.inf:
+                text = "stamps leap by %.0f s at frame %d, which is not waited for"
+                logger.warning(text, (stamp_ns - last_ns) / 1e9, frame.header.sequence)
+        elif speed:
+            due = first[1] + (stamp_ns - first[0]) / 1e9 / speed
             if stop.wait(max(0.0, due - time.monotonic())):
                 return
-        first = first or (frame.header.stamp_ns, time.monotonic())
+        last_ns = stamp_ns
         yield frame
 
 

@@ -19,6 +19,9 @@ from mushpipe.core.tables import locked
 _FARTHEST_M = 1e5  # the largest number of millimetres that is taken for metres is less
 
 
+_LATEST_NS = 2**32 * 10**9 - 1  # seconds are recorded in 32 bits
+
+
 @dataclass(frozen=True)
 class Header:
     """Where and when a frame was taken.
@@ -31,6 +34,7 @@ class Header:
 
     Raises:
         TypeError: A time or number is no integer, or `frame_id` no text.
+        ValueError: A time or number is below 0, or too large to be recorded.
     """
 
     stamp_ns: int
@@ -43,6 +47,9 @@ class Header:
             value = getattr(self, name)
             if not isinstance(value, int | np.integer):
                 raise TypeError(f"{name} of a frame's header is {value!r}, expected an integer")
+            most = 2**32 - 1 if name == "sequence" else _LATEST_NS
+            if not 0 <= value <= most:
+                raise ValueError(f"{name} of a frame's header is {value}, expected 0 to {most}")
             object.__setattr__(self, name, int(value))
         if not isinstance(self.frame_id, str):
             raise TypeError(f"frame_id of a header is {self.frame_id!r}, expected text")

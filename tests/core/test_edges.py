@@ -1,10 +1,11 @@
 """Sources and the edges of a run: opening and closing, failures, pace."""
 
 import threading
+from dataclasses import replace
 
 import pytest
 
-from mushpipe import InputError, RgbdFrame, Sink, Stage
+from mushpipe import Header, InputError, RgbdFrame, Sink, Stage
 from mushpipe.core.edges import paced
 from tests.core.lab import Frames, Lab, make_frame, soon
 
@@ -232,6 +233,18 @@ def test_pace_does_not_wait_for_the_past_or_at_speed_zero(monkeypatch):
     stop = FakeStop()
     assert len(list(paced(iter([make_frame(0), make_frame(1)]), 0, stop))) == 2
     assert stop.waits == []
+
+
+def test_a_leap_of_the_stamps_is_not_waited_for(monkeypatch, caplog):
+    """From the clock since boot to that since 1970, and an hour back."""
+    monkeypatch.setattr("mushpipe.core.edges.time.monotonic", lambda: 100.0)
+    seconds = [5.0, 5.5, 1.7e9, 1.7e9 + 0.25, 1.7e9 - 3600, 1.7e9 - 3599]
+    headers = [Header(round(at * 1e9), k, "camera") for k, at in enumerate(seconds)]
+    stop = FakeStop()
+    given = (replace(make_frame(0), header=header) for header in headers)
+    assert [frame.header for frame in paced(given, 1, stop)] == headers
+    assert stop.waits == pytest.approx([0.5, 0.25, 1.0])
+    assert "leap by -3600 s at frame 4, which is not waited for" in caplog.text
 
 
 def test_pace_stops_while_it_waits():

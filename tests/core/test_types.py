@@ -1,5 +1,7 @@
 """Frames and masks: what they check, what they compute."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -127,3 +129,17 @@ def test_a_mask_that_cannot_be(foreground, initial, message):
     with pytest.raises(ValueError) as caught:  # noqa: PT011 - the whole message is compared
         Mask(foreground, initial)
     assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ((-1, 0, "c"), "stamp_ns of a frame's header is -1, expected 0 to 4294967295999999999"),
+        ((2**63, 0, "c"), "stamp_ns of a frame's header is 9223372036854775808, expected 0 to"),
+        ((5, 2**32, "c"), "sequence of a frame's header is 4294967296, expected 0 to 4294967295"),
+        ((5, 0, "c", -2), "arrival_ns of a frame's header is -2, expected 0 to"),
+    ],
+)
+def test_a_header_that_no_recording_could_hold_is_refused(values: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Header(*values)
