@@ -130,7 +130,10 @@ class ImagesSource(ReplaySource):
         return [(path, depths.get(key)) for key, path in colors.items()]
 
     def _frame(self, header: Header, color: Path, depth: Path | None) -> RgbdFrame:
-        image = cv2.cvtColor(_read(color, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH), _TO_RGB)
+        how = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
+        if depth is not None or self.camera is not None:  # these are of the image as it was taken
+            how |= cv2.IMREAD_IGNORE_ORIENTATION
+        image = cv2.cvtColor(_read(color, how), _TO_RGB)
         values = None if depth is None else _read(depth, cv2.IMREAD_UNCHANGED)
         pinhole = self.camera.model_dump() if self.camera else None
         camera = None if pinhole is None else Camera(*image.shape[1::-1], **pinhole)
@@ -153,7 +156,7 @@ def _required(folder: Path, setting: str, names: str) -> dict[str, Path]:
     images = [path for path in files if _is_image(path)]
     kinds = Counter(str(path.relative_to(folder).with_stem("*")) for path in images or files)
     hint = ", ".join(f"{each} ({count})" for each, count in kinds.most_common(8)) or "nothing"
-    hint = hint if images else f"no image, but {hint}"
+    hint = f"no image, but {hint}" if files and not images else hint
     raise InputError(f"{folder}: no image is named {names} (source.{setting}); there is {hint}")
 
 

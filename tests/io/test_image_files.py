@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 from pydantic import ValidationError
 
 from mushpipe import InputError, RgbdFrame, UsageError
@@ -111,6 +112,19 @@ def test_any_name_will_do_where_there_is_colour_alone(tmp_path: Path) -> None:
     write(tmp_path / "a [1].jpeg", 1)
     (tmp_path / "labels.json").write_text("{}")
     assert [int(frame.color.mean()) for frame in played(tmp_path)] == [1, 2]
+
+
+def test_a_picture_is_turned_as_viewers_turn_it_but_not_beside_depth(tmp_path: Path) -> None:
+    pixels = np.zeros((*SIZE, 3), np.uint8)
+    pixels[:8] = 200
+    exif = Image.Exif()
+    exif[0x0112] = 3  # held upside down
+    Image.fromarray(pixels).save(tmp_path / "c0.jpg", exif=exif, quality=95)
+    write(tmp_path / "d0.png", 400, np.uint16, 1)
+    (alone,) = played(tmp_path, color="c*.jpg")
+    (beside,) = played(tmp_path, color="c*.jpg", depth="d*.png", depth_scale=0.001)
+    assert alone.color[-1, 0, 0] > 150 > 50 > alone.color[0, 0, 0]
+    assert beside.color[0, 0, 0] > 150 > 50 > beside.color[-1, 0, 0]
 
 
 def test_a_folder_as_the_source_is_one_of_images(tmp_path: Path) -> None:
