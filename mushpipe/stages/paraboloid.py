@@ -35,9 +35,7 @@ BEND = 0.3  # sigma of the quadratic coefficients about those of a cap, in radii
 ASPECT = 0.62  # height of a dome over the radius of its rim
 POINTED = 0.2  # sigma of the slope of a pointed top, less in its innermost BLUNT radii
 BLUNT = 0.15
-FARTHEST = (
-    2.0  # radii from the middle depth; no cap's top is, only what a fit makes of a hole's rim
-)
+FARTHEST = 2.0  # radii from the middle depth to a top; a hole's rim may suggest more
 INNER = np.flatnonzero((CELLS**2).sum(axis=1) < DISC**2)
 
 
