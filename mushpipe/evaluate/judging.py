@@ -188,15 +188,10 @@ def _unanswered(judged: Judged) -> list[Place]:
     # without any answer, these results and this truth may have nothing to do with each other
     whole = bool(answered) and not results.partial
     spans = {"stamp_ns": results.span("stamp_ns"), "index": results.span("sequence")}
-
-    def looked_at(kind: str, value: int) -> bool:
-        low, high = spans[kind]
-        return low <= value <= high
-
     return [
-        place
-        for place in judged.truth.frames
-        if place not in answered and (whole or looked_at(*place))
+        (kind, value)
+        for kind, value in judged.truth.frames
+        if (kind, value) not in answered and (whole or value in spans[kind])
     ]
 
 

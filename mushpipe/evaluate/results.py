@@ -109,14 +109,14 @@ class Results:
         """How many frames failed in the run, as far as the file says."""
         return int(self.summary.get("frames", {}).get("failed", 0))
 
-    def span(self, name: str) -> tuple[int, int]:
-        """Return the lowest and highest ``stamp_ns`` or ``sequence`` that the run looked at.
+    def span(self, name: str) -> range:
+        """Return from which to which ``stamp_ns`` or ``sequence`` the run looked at frames.
 
         Where the file does not say how the run went, those it answered stand for them.
         """
         answered = [getattr(header, name) for header, _ in self.frames]
         seen = self.summary.get("span", {}).get(name, answered)
-        return min(seen), max(seen)
+        return range(min(seen), max(seen) + 1) if seen else range(0)
 
     @property
     def robot_frames(self) -> set[str]:

@@ -8,11 +8,14 @@ from typing import Any
 
 import pytest
 from click.testing import Result
+from mcap.writer import Writer
 from typer.testing import CliRunner
 
+from mushpipe import Picks
 from mushpipe.cli import app
 from mushpipe.core.errors import EXIT_DAMAGED, EXIT_DIFFERS, InputError, UsageError
 from mushpipe.core.recorder import RecordingWriter
+from mushpipe.core.wire import table_schema
 from mushpipe.evaluate.running import unique_names
 from tests.evaluate.scenes import (
     bed,
@@ -246,6 +249,21 @@ def test_a_recording_whose_only_label_is_of_a_frame_that_failed_counts(
     labels = write_recording(tmp_path / "truth.mcap", {1: truths[1]})
     content = judged(whole, other, "--truth", tmp_path / "a.mcap", "--truth", labels)
     assert metrics(content)["recall"] == 0.5
+
+
+def test_results_that_lost_all_their_picks_say_so(tmp_path: Path, truths: dict[int, Any]) -> None:
+    """The channel is there, its messages are not, and neither is word of how the run went."""
+    schema = table_schema(Picks)
+    with (tmp_path / "r.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="mushpipe", library="a test")
+        number = writer.register_schema(schema.name, schema.encoding, schema.data)
+        writer.register_channel("/mushpipe/pick", "json", number)
+        writer.finish()
+    truth = write_recording(tmp_path / "truth.mcap", truths)
+    result = run(tmp_path / "r.mcap", "--truth", truth)
+    assert isinstance(result.exception, InputError)
+    assert str(result.exception) == "no frame of the results is labelled in truth.mcap"
 
 
 def test_several_results_are_judged_each_and_together(
