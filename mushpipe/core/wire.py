@@ -162,10 +162,9 @@ def encode_camera(camera: Camera | None, size: tuple[int, ...], header: Header) 
     """
     from foxglove.messages import CameraCalibration
 
-    k, one = [0.0] * 9, 0.0
+    k = [0.0] * 9
     if camera is not None:
-        one = 1.0
-        k = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, one]
+        k = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0]
     message = CameraCalibration(
         timestamp=timestamp(header.stamp_ns),
         frame_id=header.frame_id,
@@ -174,7 +173,7 @@ def encode_camera(camera: Camera | None, size: tuple[int, ...], header: Header) 
         distortion_model=DISTORTION_MODELS[camera.model] if camera else "",
         D=list(camera.coefficients) if camera else [],
         K=k,
-        R=[one, 0.0, 0.0, 0.0, one, 0.0, 0.0, 0.0, one],
+        R=[k[8], 0.0, 0.0, 0.0, k[8], 0.0, 0.0, 0.0, k[8]],
         P=[*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0],
     )
     return Message("", foxglove_schema("CameraCalibration"), message.encode())
