@@ -17,9 +17,9 @@ from mushpipe.core.geometry import Camera
 from mushpipe.core.tables import locked
 
 _FARTHEST_M = 1e5  # the largest number of millimetres that is taken for metres is less
-
-
 _LATEST_NS = 2**32 * 10**9 - 1  # seconds are recorded in 32 bits
+COLOR_FRAME = "camera_color_optical_frame"
+"""The frame of the colour images, and of aligned depth, by realsense2_camera's name."""
 
 
 @dataclass(frozen=True)

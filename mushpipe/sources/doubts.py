@@ -2,16 +2,31 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mushpipe.core.types import RgbdFrame
+
+logger = logging.getLogger("mushpipe")
 FARTHEST_M = 30.0
 COARSE_M = 0.003  # a cap of 30 mm rises by 9
 _FEWEST_LEVELS = 6
 _FEWEST_EACH = 8  # depths a level: unlike steps, chance seldom meets a level twice
+
+
+def warned(name: str, frame: RgbdFrame) -> bool:
+    """Warn of a recording's depth where it is odd; return whether there is any to be judged by."""
+    if frame.depth is None:
+        return False
+    depth = frame.depth[::8, ::8] * frame.depth_scale
+    known = depth[np.isfinite(depth) & (depth > 0)]
+    for doubt in doubts(known):
+        logger.warning("%s, frame %d: %s", name, frame.header.sequence, doubt)
+    return len(known) > 0
 
 
 def doubts(depth: NDArray[Any]) -> Iterator[str]:

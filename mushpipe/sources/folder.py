@@ -16,17 +16,14 @@ from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from mushpipe import Header, InputError, ReplaySource, RgbdFrame, UsageError
-from mushpipe.core.geometry import Camera
 from mushpipe.core.paths import GraphPath
-from mushpipe.sources.doubts import doubts
-from mushpipe.sources.mcap import NO_CAMERA
-from mushpipe.sources.playing import NO_DEPTH
-from mushpipe.sources.recorded import Intrinsics
+from mushpipe.core.types import COLOR_FRAME
+from mushpipe.sources.doubts import warned
+from mushpipe.sources.recorded import NO_CAMERA, NO_DEPTH, Intrinsics
 
 logger = logging.getLogger("mushpipe")
 SUFFIXES = frozenset(["png", "jpg", "jpeg", "tif", "tiff", "bmp", "webp", "pgm", "ppm"])
 _TO_RGB = cv2.COLOR_BGR2RGB
-FRAME_ID = "camera_color_optical_frame"
 ALONE = "%s images without a %s image"
 
 
@@ -49,6 +46,7 @@ class ImagesSource(ReplaySource):
     camera: Intrinsics | None = Field(None, description="intrinsics of the colour images")
     fps: float = Field(30, gt=0, le=1000, description="frames per second")
 
+    _found: list[tuple[Path, Path | None]] = PrivateAttr(default_factory=list)
     _counts: Counter[str] = PrivateAttr(default_factory=Counter)
 
     @field_validator("color", "depth")
@@ -80,14 +78,14 @@ class ImagesSource(ReplaySource):
             UsageError: There is no such folder.
             InputError: It holds no such images, or none that belong together.
         """
-        self._pairs()
+        self._found = self._pairs()
 
     def counts(self) -> dict[str, int]:
         """Return how many images are without a partner."""
         return dict(sorted(self._counts.items()))
 
     def frames(self) -> Iterator[RgbdFrame]:
-        """Yield a frame per colour image.
+        """Yield a frame per colour image that there was when the source was opened.
 
         Raises:
             InputError: A file cannot be read, or is not what it should be.
@@ -97,14 +95,10 @@ class ImagesSource(ReplaySource):
         if self.camera is None:
             logger.warning(NO_CAMERA, self.name(), "")
         judged = False
-        for sequence, (color, depth) in enumerate(self._pairs()):
-            header = Header(round(sequence * 1e9 / self.fps), sequence, FRAME_ID)
+        for sequence, (color, depth) in enumerate(self._found):
+            header = Header(round(sequence * 1e9 / self.fps), sequence, COLOR_FRAME)
             frame = self._frame(header, color, depth)
-            if not judged and frame.depth is not None:
-                known = frame.depth_m[frame.depth_m > 0]
-                judged = len(known) > 0
-                for doubt in doubts(known):
-                    logger.warning("%s: %s", depth, doubt)
+            judged = judged or warned(self.name(), frame)
             yield frame
 
     def _pairs(self) -> list[tuple[Path, Path | None]]:
@@ -135,8 +129,7 @@ class ImagesSource(ReplaySource):
             how |= cv2.IMREAD_IGNORE_ORIENTATION
         image = cv2.cvtColor(_read(color, how), _TO_RGB)
         values = None if depth is None else _read(depth, cv2.IMREAD_UNCHANGED)
-        pinhole = self.camera.model_dump() if self.camera else None
-        camera = None if pinhole is None else Camera(*image.shape[1::-1], **pinhole)
+        camera = self.camera.of_image(image.shape[:2]) if self.camera else None
         try:
             return RgbdFrame(header, image, values, self.depth_scale or 0.001, camera)
         except ValueError as error:

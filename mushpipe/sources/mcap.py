@@ -17,12 +17,11 @@ from mushpipe.core.paths import GraphPath
 from mushpipe.core.recording import GRAPH, MANIFEST, Index, RecordingReader
 from mushpipe.core.stage import ReplaySource
 from mushpipe.core.types import RgbdFrame
-from mushpipe.sources.playing import NO_DEPTH, Player
-from mushpipe.sources.recorded import RecordedSource
+from mushpipe.sources.playing import Player
+from mushpipe.sources.recorded import NO_CAMERA, NO_DEPTH, RecordedSource
 from mushpipe.sources.topics import Topics, choose_topics
 
 logger = logging.getLogger("mushpipe")
-NO_CAMERA = "%s has no calibration%s: nothing can be measured in metres"
 
 
 class McapSource(RecordedSource, ReplaySource):

@@ -9,17 +9,15 @@ from dataclasses import replace
 from types import EllipsisType
 from typing import Any, TypeVar
 
-import numpy as np
 from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoders
 from mcap_ros2.decoder import DecoderFactory as Ros2Decoders
-from numpy.typing import NDArray
 
 from mushpipe.core import wire
 from mushpipe.core.errors import InputError
 from mushpipe.core.geometry import Camera
 from mushpipe.core.recording import Raw
 from mushpipe.core.types import Header, RgbdFrame
-from mushpipe.sources.doubts import doubts
+from mushpipe.sources.doubts import warned
 from mushpipe.sources.images import decode_camera, decode_color, decode_depth, distortion
 from mushpipe.sources.pairing import Pairing
 from mushpipe.sources.recorded import RecordedSource
@@ -28,7 +26,6 @@ from mushpipe.sources.topics import Topics, is_beside, says_aligned
 T = TypeVar("T")
 logger = logging.getLogger("mushpipe")
 MOST_BESIDE = 256  # frames of which something waits that was recorded beside them
-NO_DEPTH = "%s has no depth: positions, distances and diameters will be missing"
 
 
 class Player:
@@ -215,8 +212,7 @@ class Player:
             frame = RgbdFrame(header, image, native, scale, self._camera(image.shape[:2], camera))
         except ValueError as error:
             raise InputError(f"{self.name}, frame {sequence}: {error}") from error
-        if frame.depth is not None and not self._judged:
-            self._judge_depth(sequence, frame.depth[::8, ::8] * frame.depth_scale)
+        self._judged = self._judged or warned(self.name, frame)
         return frame
 
     def _check_calibration(self, frame_id: str) -> None:
@@ -231,18 +227,11 @@ class Player:
                 f"source.camera_topic={topic}), or set source.camera: {{fx: , fy: , cx: , cy: }}"
             )
 
-    def _judge_depth(self, sequence: int, depth: NDArray[Any]) -> None:
-        """Warn, once, of depth (m) that no camera above a bed can have measured, or a poor one."""
-        known = depth[np.isfinite(depth) & (depth > 0)]
-        self._judged = len(known) > 0
-        for doubt in doubts(known):
-            logger.warning("%s, frame %d: %s", self.name, sequence, doubt)
-
     def _camera(self, size: tuple[int, ...], recorded: _Calibration) -> Camera | None:
         given = self.settings.camera
         if given is None:
             return self.camera if recorded is ... else recorded
-        return Camera(size[1], size[0], given.fx, given.fy, given.cx, given.cy)
+        return given.of_image(size)
 
     def _watch_size(self, size: tuple[int, ...], sequence: int) -> None:
         if self.size not in (None, size) and self.size:

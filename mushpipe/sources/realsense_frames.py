@@ -18,13 +18,12 @@ from mushpipe.core.errors import InputError
 from mushpipe.core.geometry import Camera
 from mushpipe.core.libraries import import_realsense
 from mushpipe.core.tables import Columns, column
-from mushpipe.core.types import Header, RgbdFrame
+from mushpipe.core.types import COLOR_FRAME, Header, RgbdFrame
 from mushpipe.core.wire import Message
 from mushpipe.sources.images import decode_color
 from mushpipe.sources.realsense_device import camera_of
 from mushpipe.sources.realsense_link import Link
 
-FRAME_ID = "camera_color_optical_frame"
 CLOCK_TOPIC = "/camera/clock"
 LOST = "frames lost between the sensor and this program"
 UNPAIRED = "colour or depth images without a partner"
@@ -177,7 +176,7 @@ class FrameMaker:
             self._counts[AWAY] += max(0, arrival_ns - self._last_arrival_ns) // 10**6
             self._resumed = False
         self._last_arrival_ns = arrival_ns
-        return Header(stamp_ns, self._number(color), FRAME_ID, arrival_ns)
+        return Header(stamp_ns, self._number(color), COLOR_FRAME, arrival_ns)
 
     def _number(self, color: Any) -> int:
         """Return the frame's number: the sensor's own, but from 0 and never going back."""

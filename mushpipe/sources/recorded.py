@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from mushpipe.core.geometry import Camera
 from mushpipe.core.stage import Source
+
+NO_DEPTH = "%s has no depth: positions, distances and diameters will be missing"
+NO_CAMERA = "%s has no calibration%s: nothing can be measured in metres"
 
 
 class Intrinsics(BaseModel):
@@ -16,6 +20,10 @@ class Intrinsics(BaseModel):
     fy: float = Field(gt=0, description="focal length along y, px")
     cx: float = Field(description="principal point, x, px")
     cy: float = Field(description="principal point, y, px")
+
+    def of_image(self, size: tuple[int, ...]) -> Camera:
+        """Return the camera of images of some height and width, px."""
+        return Camera(size[1], size[0], self.fx, self.fy, self.cx, self.cy)
 
 
 class RecordedSource(Source):

@@ -24,8 +24,8 @@ from mushpipe.core import wire
 from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.recording import GARBAGE, MANIFEST, Raw
 from mushpipe.core.types import RgbdFrame
-from mushpipe.sources.playing import NO_DEPTH, Player
-from mushpipe.sources.recorded import RecordedSource
+from mushpipe.sources.playing import Player
+from mushpipe.sources.recorded import NO_DEPTH, RecordedSource
 from mushpipe.sources.topics import Topics
 
 logger = logging.getLogger("mushpipe")

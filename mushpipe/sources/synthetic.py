@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 
 from mushpipe import Header, ReplaySource, RgbdFrame
 from mushpipe.core.truth import INSTANCES_TOPIC, TRUTH_TOPIC
+from mushpipe.core.types import COLOR_FRAME
 from mushpipe.sim.photo import ColorCamera
 from mushpipe.sim.scene import Scene
 from mushpipe.sim.sensor import DepthSensor
@@ -65,7 +66,7 @@ class SyntheticSource(SceneSettings, ReplaySource):
         still = scene.still(self._along(sequence, travel))
         lost = self.missing_depth is not None and sequence % self.missing_depth == 1
         return RgbdFrame(
-            Header(self._stamp_ns(sequence), sequence, "camera_color_optical_frame"),
+            Header(self._stamp_ns(sequence), sequence, COLOR_FRAME),
             scene.color(still, sequence),
             None if lost else scene.depth(still, sequence),
             self.sensor.unit_mm / 1000,

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import re
+from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 from mushpipe.core.errors import InputError, suggest
@@ -19,9 +20,9 @@ IMAGES = {
 CALIBRATIONS = {"sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration"}
 _NOT_CAMERA = (RESULT_PREFIX, "/truth/")
 ALIGNED = "aligned_depth_to_color"
-# What parts of a topic say of the images, and not of the camera.
-_OF_IMAGES = re.compile("colou?r|rgb|depth|image|rect|registered|stereo|infra|compressed")
 _WORDS = {"depth": ("depth",), "infra": ("infra",), "color": ("color", "colour", "rgb")}
+# What else parts of a topic say of the images, and not of the camera.
+_OF_IMAGES = ("image", "rect", "registered", "stereo")
 _TRANSPORTS = ("/compressedDepth", "/compressed")
 
 
@@ -94,9 +95,13 @@ def _kind(topic: str) -> str:
     """
     for part in reversed(_base(topic).lower().split("/")):
         for kind, words in _WORDS.items():
-            if any(word in part for word in words):
+            if _says(part, words):
                 return kind
     return ""
+
+
+def _says(part: str, words: Iterable[str]) -> bool:
+    return any(word in part for word in words)
 
 
 def _colors(images: list[str]) -> list[str]:
@@ -141,8 +146,9 @@ def says_aligned(depth: str, color: str) -> bool:
 
 def _other_camera(depth: str, color: str) -> bool:
     """Return whether two topics name two cameras: /left/color/image and /right/depth/image."""
+    words = (*chain(*_WORDS.values()), *_OF_IMAGES)
     cameras = [
-        [part for part in topic.lower().split("/") if part and not _OF_IMAGES.search(part)]
+        [part for part in _base(topic).lower().split("/") if part and not _says(part, words)]
         for topic in (depth, color)
     ]
     return any(a != b for a, b in zip(*cameras, strict=False))
