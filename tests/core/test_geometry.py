@@ -220,3 +220,24 @@ def test_a_point_beyond_the_fold_of_a_lens_is_not_in_the_image():
     inside, beyond = lens.project(np.array([[0.99 * fold, 0, 1], [1.01 * fold, 0, 1.0]]))
     assert inside[0] == pytest.approx(319.5 + 400 * 0.99 * fold * (1 - 0.3 * (0.99 * fold) ** 2))
     assert np.isnan(beyond).all()
+
+
+def test_the_two_readings_of_a_d455s_lens_part_by_what_the_docs_say() -> None:
+    """As OpenCV has them: into the image by `undistortPoints`, out of it by `projectPoints`."""
+    lens = (-0.0565362684, 0.0682018697, 0.0003659752, 0.0006925757, -0.0218431670)
+    width, height, fx, fy, cx, cy = 640, 480, 385.0, 384.4, 321.7, 238.9
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    pixels = np.array(
+        [[x, y] for y in range(0, height, 60) for x in range(0, width + 1, 80)], float
+    )
+    into = cv2.undistortPoints(pixels, matrix, np.array(lens))[:, 0]
+    flat = np.column_stack([(pixels - (cx, cy)) / (fx, fy), np.ones(len(pixels))])
+    out_of = cv2.projectPoints(flat, np.zeros(3), np.zeros(3), np.eye(3), np.array(lens))[0][:, 0]
+    apart = 1000 * np.hypot(*(into - out_of).T)
+    assert apart.max() == pytest.approx(27, abs=0.5)
+    half_way = apart[(pixels == (160, 240)).all(axis=1) | (pixels == (480, 240)).all(axis=1)]
+    assert half_way == pytest.approx([7, 7], abs=1.5)
+    for model, rays in (("brown_conrady", into), ("inverse_brown_conrady", out_of)):
+        camera = Camera(width, height, fx, fy, cx, cy, model, lens)
+        found = camera.deproject(pixels, np.ones(len(pixels)))[:, :2]
+        assert found == pytest.approx(rays, abs=2e-5)
