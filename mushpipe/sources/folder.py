@@ -48,6 +48,7 @@ class ImagesSource(ReplaySource):
 
     _found: list[tuple[Path, Path | None]] = PrivateAttr(default_factory=list)
     _counts: Counter[str] = PrivateAttr(default_factory=Counter)
+    _first: tuple[int, ...] | None = PrivateAttr(None)  # height and width of the first image
 
     @field_validator("color", "depth")
     @classmethod
@@ -129,8 +130,10 @@ class ImagesSource(ReplaySource):
             how |= cv2.IMREAD_IGNORE_ORIENTATION
         image = cv2.cvtColor(_read(color, how), _TO_RGB)
         values = None if depth is None else _read(depth, cv2.IMREAD_UNCHANGED)
-        camera = self.camera.of_image(image.shape[:2]) if self.camera else None
+        size = image.shape[:2]
+        self._first = self._first or size
         try:
+            camera = self.camera.of_image(size, self._first) if self.camera else None
             return RgbdFrame(header, image, values, self.depth_scale or 0.001, camera)
         except ValueError as error:
             files = color if depth is None else f"{color} and {depth}"

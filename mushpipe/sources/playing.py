@@ -64,7 +64,8 @@ class Player:
         self.camera: Camera | None = None
         self.error = ""
         self.frames = 0
-        self.size: tuple[int, ...] | None = None
+        self._first: tuple[int, ...] | None = None  # size of the first image
+        self._size: tuple[int, ...] | None = None  # of the last
         self._factories = (ProtobufDecoders(), Ros2Decoders())
         self._calibrated = ""  # frame of the calibration
         self._stated = False  # whether there was a calibration, or word that there is none
@@ -231,13 +232,13 @@ class Player:
         given = self.settings.camera
         if given is None:
             return self.camera if recorded is ... else recorded
-        return given.of_image(size)
+        return given.of_image(size, self._first or size)
 
     def _watch_size(self, size: tuple[int, ...], sequence: int) -> None:
-        if self.size not in (None, size) and self.size:
-            old, new = (f"{s[1]}x{s[0]}" for s in (self.size, size))
+        if self._size not in (None, size) and self._size:
+            old, new = (f"{s[1]}x{s[0]}" for s in (self._size, size))
             logger.warning("the frame size changes from %s to %s at frame %d", old, new, sequence)
-        self.size = size
+        self._first, self._size = self._first or size, size
 
 
 _Calibration = Camera | None | EllipsisType  # which is that nothing was stated yet

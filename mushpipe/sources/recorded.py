@@ -21,8 +21,27 @@ class Intrinsics(BaseModel):
     cx: float = Field(description="principal point, x, px")
     cy: float = Field(description="principal point, y, px")
 
-    def of_image(self, size: tuple[int, ...]) -> Camera:
-        """Return the camera of images of some height and width, px."""
+    def of_image(self, size: tuple[int, ...], first: tuple[int, ...]) -> Camera:
+        """Return the camera of an image.
+
+        Args:
+            size: Height and width, px.
+            first: Those of the first image, which these intrinsics are taken to be of.
+
+        Raises:
+            ValueError: The size is another, or these intrinsics are of larger images.
+        """
+        here = f"{size[1]}x{size[0]}"
+        if size != first:
+            raise ValueError(
+                f"the image is {here}, the first one {first[1]}x{first[0]}: source.camera holds "
+                "for images of one size"
+            )
+        if not (0 <= self.cx < size[1] and 0 <= self.cy < size[0]):
+            raise ValueError(
+                f"the principal point of source.camera, ({self.cx:g}, {self.cy:g}), lies outside "
+                f"of the image, which is {here}: intrinsics for that size are expected"
+            )
         return Camera(size[1], size[0], self.fx, self.fy, self.cx, self.cy)
 
 

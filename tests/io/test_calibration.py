@@ -226,6 +226,22 @@ def test_a_given_camera_takes_the_place_of_one_that_cannot_be_decoded(tmp_path: 
     assert cameras(tmp_path, entries, camera=given) == [expected] * 3
 
 
+def test_a_given_camera_holds_for_images_of_one_size(tmp_path: Path) -> None:
+    given = {"fx": 600.0, "fy": 600.0, "cx": 2.0, "cy": 1.0}
+    frames, error = drain(McapSource(path=write_bag(tmp_path, shrinking()), camera=given))
+    assert [frame.camera for frame in frames] == [Camera(WIDTH, HEIGHT, 600.0, 600.0, 2.0, 1.0)]
+    message = "frame 1: the image is 4x3, the first one 8x6: source.camera holds for images of one"
+    assert message in str(error)
+
+
+def test_a_given_camera_of_larger_images_is_refused(tmp_path: Path) -> None:
+    given = {"fx": 600.0, "fy": 600.0, "cx": 8.0, "cy": 3.0}
+    with pytest.raises(
+        InputError, match=r"principal point of source.camera, \(8, 3\), lies outside"
+    ):
+        cameras(tmp_path, [color_at(0)], camera=given)
+
+
 @pytest.mark.parametrize("value", [float("inf"), float("nan")])
 def test_a_camera_has_finite_numbers(value: float) -> None:
     with pytest.raises(ValueError, match="finite"):

@@ -198,6 +198,19 @@ def test_depth_is_no_colour_and_a_damaged_file_no_image(tmp_path: Path) -> None:
         played(tmp_path)
 
 
+def test_a_camera_holds_for_images_of_one_size(tmp_path: Path) -> None:
+    write(tmp_path / "0.png", 1)
+    cv2.imwrite(str(tmp_path / "1.png"), np.zeros((12, 16, 3), np.uint8))
+    assert len(played(tmp_path)) == 2
+    given = {"fx": 40, "fy": 40, "cx": 15.5, "cy": 11.5}
+    with pytest.raises(InputError, match=r"1\.png: the image is 16x12, the first one 32x24"):
+        played(tmp_path, camera=given)
+    with pytest.raises(
+        InputError, match=r"0\.png: the principal point of source.camera, \(15.5, 24"
+    ):
+        played(tmp_path, camera={**given, "cy": 24})
+
+
 def test_depth_needs_its_unit_and_names_one_star(tmp_path: Path) -> None:
     with pytest.raises(ValidationError, match="with depth, set depth_scale"):
         ImagesSource(path=tmp_path, depth="*.png")
