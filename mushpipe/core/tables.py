@@ -30,6 +30,11 @@ def locked(array: Any, dtype: Any) -> NDArray[Any]:
     return result
 
 
+def _as_given(array: NDArray[Any], given: Any) -> bool:
+    """Return whether conversion has changed no value; NumPy cuts a fraction off without a word."""
+    return getattr(given, "dtype", None) == array.dtype or np.array_equal(array, given)
+
+
 def column(*shape: int, dtype: type = np.float64) -> Any:
     """Declare a field of `Columns`: an array of shape (N, *shape) and the given dtype."""
     return field(metadata={"shape": shape, "dtype": dtype})
@@ -39,13 +44,20 @@ class Columns:
     """Base of the per-mushroom types: every field made by `column` has the same length N.
 
     Raises:
-        ValueError: A field has the wrong shape, lengths differ, or `check` objects.
+        ValueError: A field has the wrong shape, lengths differ, a column of integers is given
+            fractions or NaN, or `check` objects.
     """
 
     def __post_init__(self) -> None:
         length: int | None = None
         for name, (shape, dtype) in self._columns().items():
-            array = locked(getattr(self, name), dtype)
+            given = getattr(self, name)
+            array = locked(given, dtype)
+            if dtype.kind in "biu" and not _as_given(array, given):
+                raise ValueError(
+                    f"{type(self).__name__}.{name} is declared {dtype}, and was given what that "
+                    "cannot hold"
+                )
             if array.shape == (0,):  # an empty list, of which nothing tells the shape of a row
                 array = array.reshape(0, *shape)
             if array.shape[1:] != shape or array.ndim == 0:

@@ -199,6 +199,22 @@ def test_columns_of_ones_own():
         Sizes("x", np.zeros((2, 2)))
 
 
+@given(arrays(np.float64, st.integers(1, 5)), st.sampled_from([np.int64, np.uint8, np.bool_]))
+@pytest.mark.filterwarnings("ignore:invalid value encountered in cast")
+def test_integers_take_whole_numbers_and_nothing_that_they_would_cut(values, dtype):
+    @dataclass(frozen=True, eq=False)
+    class Counts(Columns):
+        count: np.ndarray = column(dtype=dtype)
+
+    low, high = (0, 1) if dtype is np.bool_ else (np.iinfo(dtype).min, np.iinfo(dtype).max)
+    whole = [float(value).is_integer() and low <= int(value) <= high for value in values]
+    if all(whole):
+        assert Counts(values).count.tolist() == [int(value) for value in values]
+    else:
+        with pytest.raises(ValueError, match=r"^Counts\.count is declared u?(int|bool)"):
+            Counts(values)
+
+
 @given(arrays(np.float64, st.tuples(st.integers(0, 5), st.just(2))))
 def test_any_finite_circles_are_taken_and_no_others(center):
     n = len(center)
