@@ -110,14 +110,16 @@ class RerunSink(Sink):
             self._require_room()
             sinks.append(rr.FileSink(str(self._path), write_footer=self.index))
         sinks += [rr.GrpcSink(url) for url in self._viewers()]
-        self._recording = rr.RecordingStream("mushpipe", recording_id=run.recording)
+        # An id of its own for every run: those that share one are a single recording to a viewer.
+        self._recording = rr.RecordingStream("mushpipe")
         try:
             self._held = opened_alone(self._path) if self._path else None  # set_sinks empties it
             self._recording.set_sinks(*sinks)
         except (OSError, RuntimeError) as error:
             raise UsageError(f"save: {self.save} cannot be written: {error}") from error
         self._memories = (Remembering(self._recording), Remembering(self._recording))
-        graph = run.manifest.get("graph", {})
+        graph, file = run.manifest.get("graph", {}), Path(run.manifest.get("graph_file", ""))
+        self._recording.send_recording_name(f"{run.recording} {file.stem}".strip())
         self._base = base_of(graph)
         log_start(self._recording, workspace_of(graph), self._base)
         image_hz = self.image_hz or (LIVE_IMAGE_HZ if run.live else None)

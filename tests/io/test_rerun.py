@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
 
 from mushpipe import Circles, Mask, Picks, RunInfo
@@ -27,6 +28,19 @@ def test_frames_stand_on_two_timelines(tmp_path: Path) -> None:
     color = found[f"{IMAGE}/color"]
     assert color["frame"] == [10, 11, 12]
     assert color["capture"] == [T0 + i * PERIOD for i in range(3)]
+
+
+def test_runs_of_one_recording_are_told_apart_by_viewers(tmp_path: Path) -> None:
+    for name in ("pick", "classic"):
+        sink = RerunSink(save=tmp_path / f"{name}.rrd")
+        sink.open(RunInfo("bed", {"graph_file": f"graphs/{name}.yaml"}))
+        sink.consume(trace_of(make_frame(0)))
+        sink.close()
+    files = [tmp_path / "pick.rrd", tmp_path / "classic.rrd"]
+    runs = [entry for file in files for entry in RrdReader(file).recordings()]
+    assert len({entry.recording_id for entry in runs}) == 2
+    names = [values(read(file), "/__properties", "name") for file in files]
+    assert names == [[["bed pick"]], [["bed classic"]]]
 
 
 def test_a_disk_that_is_all_but_full_ends_the_file_and_hangs_nobody(
