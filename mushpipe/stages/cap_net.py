@@ -35,6 +35,11 @@ _BLOCK = 32  # px; the coarsest stride
 _KNOWN = (7.0, 60.0)
 _LARGEST_SCALE = 4.0
 _LEAST_KNOWN = 0.35  # share of the pixels with depth from which on depth tells enough
+# Depth shrinks the image in such steps: every size of it has a session of its own.
+_STEP, _LEAST_SCALE = 0.8, 0.2
+
+
+Positive = Annotated[float, Field(gt=0)]
 
 
 class CapNet(Stage):
@@ -44,10 +49,13 @@ class CapNet(Stage):
     2019, arXiv 1904.07850). The score is the height of a circle's peak. Depth is not looked at.
     """
 
-    radius_px: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]] = Field(
+    radius_px: tuple[Positive, Positive | None] = Field(
         (8, 45),
         description="smallest and largest radius, px; circles may be a tenth beyond; the image is "
-        "scaled to suit",
+        "scaled to suit. [8, null]: 60 px, or what largest_mm is at the depth that is seen",
+    )
+    largest_mm: float = Field(
+        90, ge=1, description="largest diameter, mm, where radius_px leaves it to depth"
     )
     beside_depth: float = Field(
         1.0,
@@ -66,9 +74,10 @@ class CapNet(Stage):
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
-        if self.radius_px[0] >= self.radius_px[1]:
+        smallest, largest = self.radius_px
+        if smallest >= (largest or _KNOWN[1]):
             raise ValueError("radius_px must be [smallest, largest]")
-        if self.scale() > _LARGEST_SCALE:
+        if _scale_for(smallest, largest or _KNOWN[1]) > _LARGEST_SCALE:
             raise ValueError("radius_px lies below what an image shows of a cap; is it in px?")
         return self
 
@@ -104,7 +113,7 @@ class CapNet(Stage):
             UsageError: The model's output has not the shape of `cap-net`.
         """
         height, width = frame.color.shape[:2]
-        scale = self.scale() * (self.beside_depth if _has_depth(frame) else 1)
+        scale, largest = self.scaling(frame)
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
         maps = self._maps(frame.color if scale == 1 else resized(frame.color, size))
         # pixel x of the frame lies at ratio (x + 1/2) - 1/2 of the scaled image
@@ -112,7 +121,7 @@ class CapNet(Stage):
         circles, score = circles_of(maps, self.min_score)
         circles[:, :2] = (circles[:, :2] + 0.5) * ratio - 0.5
         circles[:, 2] *= np.sqrt(ratio.prod())
-        within = self._within(circles, width, height)
+        within = self._within(circles, width, height, largest)
         circles, score = circles[within], score[within]
         keep = first_of_each(circles, self.overlap)
         # the maps reach beyond the image, to whole blocks
@@ -121,19 +130,32 @@ class CapNet(Stage):
         found = Circles(circles[keep, :2], circles[keep, 2], score[keep])
         return Mask(cap[:height, :width] > 0), found
 
-    def scale(self) -> float:
-        """Return by how much the image is scaled to bring the range of radii to the known ones."""
-        least, most = _KNOWN[0] / self.radius_px[0], _KNOWN[1] / self.radius_px[1]
-        if least > most:
-            return float(np.sqrt(least * most))
-        return float(np.clip(1.0, least, most))
+    def scaling(self, frame: RgbdFrame) -> tuple[float, float]:
+        """Return by how much a frame's image is scaled, and the largest radius, px of the frame.
 
-    def _within(self, circles: Floats, width: int, height: int) -> NDArray[np.bool_]:
+        The scale brings the radii to those that the network knows.
+        """
+        depth = _depth_seen(frame)
+        smallest, largest = self.radius_px
+        scale = _scale_for(smallest, largest or _KNOWN[1])
+        scale *= 1.0 if depth is None else self.beside_depth
+        if largest is not None:
+            return scale, largest
+        if depth is None or frame.camera is None:
+            return scale, _KNOWN[1]
+        largest = max(_KNOWN[1], self.largest_mm / 2000 * frame.camera.fx / depth)
+        # Of small caps the network sees less then; a detector that uses depth finds those itself.
+        while scale * largest > _KNOWN[1] and scale > _LEAST_SCALE:
+            scale *= _STEP
+        return scale, largest
+
+    def _within(
+        self, circles: Floats, width: int, height: int, largest: float
+    ) -> NDArray[np.bool_]:
         """Return which circles (N, 3) are within the range, their centres within the image."""
         x, y, radius = circles.T
         inside = (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
-        smallest, largest = self.radius_px
-        sized = (radius >= LEAST_OF_RANGE * smallest) & (radius <= MOST_OF_RANGE * largest)
+        sized = (radius >= LEAST_OF_RANGE * self.radius_px[0]) & (radius <= MOST_OF_RANGE * largest)
         return np.asarray(inside & sized)
 
     def _maps(self, color: NDArray[np.uint8]) -> Maps:
@@ -156,9 +178,23 @@ class CapNet(Stage):
         return np.asarray(maps[0], np.float32)
 
 
-def _has_depth(frame: RgbdFrame) -> bool:
-    """Return whether the frame has so much depth that a detector can rely on it."""
-    return frame.depth is not None and bool((frame.depth[::8, ::8] > 0).mean() >= _LEAST_KNOWN)
+def _scale_for(smallest: float, largest: float) -> float:
+    """Return by how much an image is scaled to bring a range of radii, px, to the known ones."""
+    least, most = _KNOWN[0] / smallest, _KNOWN[1] / largest
+    if least > most:
+        return float(np.sqrt(least * most))
+    return float(np.clip(1.0, least, most))
+
+
+def _depth_seen(frame: RgbdFrame) -> float | None:
+    """Return the median depth, m; None where a detector cannot rely on it, so little is known."""
+    if frame.depth is None:
+        return None
+    depth = frame.depth[::8, ::8]
+    known = depth[(depth > 0) & np.isfinite(depth)]
+    if len(known) < _LEAST_KNOWN * depth.size:
+        return None
+    return float(np.median(known)) * frame.depth_scale
 
 
 @borrower

@@ -54,6 +54,7 @@ _EVERY = 2  # edge points; of so many one votes where network and depth bring ca
 _SEEN = 0.1  # of `learned`; without depth, what the network sees less of is no cap
 _SURE = 0.8  # of a network's circle, from which on it is taken for a cap though it has no outline
 _LIKELY = 0.5  # score from which on a circle is more likely a cap than not
+_LARGE = 80.0  # px; radius up to which caps are looked for in any case where [8, null] is set
 _SMALLEST = 12  # px; images smaller than this in either direction hold no circle
 
 
@@ -98,10 +99,11 @@ class PhaseHough(Stage):
     input: Literal["image", "mask"] = Field(
         "image", description="where edges are taken from; `mask` is the paper's variant, no depth"
     )
-    radius_px: tuple[Positive, Positive] | None = Field(
+    radius_px: tuple[Positive, Positive | None] | None = Field(
         (8.0, 38.0),
         description="smallest and largest radius looked for, px; outlines may be fitted a tenth "
-        "beyond; null takes them from diameter_mm and depth",
+        "beyond; null takes them from diameter_mm and depth. [8, null]: 80 px, or more where depth "
+        "says that a cap of diameter_mm is larger",
     )
     diameter_mm: tuple[Positive, Positive] = Field(
         (6.0, 120.0), description="smallest and largest diameter, mm, where there is depth"
@@ -130,7 +132,7 @@ class PhaseHough(Stage):
     def _ordered(self) -> Self:
         for name in ("radius_px", "diameter_mm"):
             value = getattr(self, name)
-            if value is not None and value[0] >= value[1]:
+            if value is not None and value[0] >= (value[1] or _LARGE):
                 raise ValueError(f"{name} must be [smallest, largest]")
         if self.diameter_mm[1] < 1:
             raise ValueError("diameter_mm is in mm, and below 1 mm: was it given in m?")
@@ -239,6 +241,8 @@ class PhaseHough(Stage):
     def _range(self, relief: Relief | None, height: int, width: int) -> tuple[float, float]:
         """Return the smallest and largest radius, px, no larger than the image."""
         smallest, largest = self.radius_px or (8.0, 38.0)
+        if largest is None:
+            largest = max(_LARGE, self.diameter_mm[1] / 2000 / relief.pixel if relief else 0)
         if self.radius_px is None and relief is not None:
             # a cap is nearer than the bed, hence larger in the image
             near = relief.bed_pixel(*np.array([(0, width, 0, width), (0, 0, height, height)]))

@@ -62,9 +62,9 @@ def test_a_range_of_larger_caps_is_met_by_scaling_the_image() -> None:
     size = (2 * frame.color.shape[1], 2 * frame.color.shape[0])
     twice = RgbdFrame(HEADER, cv2.resize(frame.color, size, interpolation=cv2.INTER_CUBIC))
     stage = CapNet(radius_px=(12, 45))
-    assert stage.scale() == 1
+    assert stage.scaling(frame) == (1, 45)
     large = CapNet(radius_px=(24, 90))
-    assert large.scale() < 1
+    assert large.scaling(twice)[0] < 1
     (_, circles), (mask, found) = stage.process(frame), large.process(twice)
     assert mask.foreground.shape == (960, 1280)
     # near the ends of the range a circle may be in one answer and not in the other
@@ -75,6 +75,29 @@ def test_a_range_of_larger_caps_is_met_by_scaling_the_image() -> None:
     assert near.mean() > 0.9
     ratio = found.radius[away.argmin(axis=1)[near]] / radius[near]
     assert np.median(ratio) == pytest.approx(1, rel=0.04)
+
+
+@pytest.mark.parametrize(
+    ("depth", "scale", "largest"),
+    [(0.6, 0.8, 60.0), (0.4, 0.8, 69.4), (0.3, 0.64, 92.6), (0.15, 0.8**6, 185.1), (0.01, 0, 2777)],
+)
+def test_depth_tells_how_large_caps_are_in_the_image(
+    depth: float, scale: float, largest: float
+) -> None:
+    stage = CapNet(radius_px=(8, None), beside_depth=0.8)
+    frame = first("first-bed")
+    assert frame.camera is not None
+    assert frame.camera.fx == pytest.approx(617, abs=1)
+    near = replace(frame, depth=np.full(frame.color.shape[:2], depth, np.float32), depth_scale=1.0)
+    found, radius = stage.scaling(near)
+    assert radius == pytest.approx(largest, rel=1e-3)  # fx 90 mm / 2 / depth
+    if scale:
+        assert found == pytest.approx(scale)
+        assert found * radius <= 60
+    else:
+        assert found >= 0.16  # whatever the depth: a smaller image shows no cap
+    assert stage.scaling(replace(near, camera=None)) == (0.8, 60)
+    assert stage.scaling(replace(near, depth=None)) == (1, 60)
 
 
 def test_beside_depth_the_image_is_scaled_and_the_answer_scaled_back() -> None:

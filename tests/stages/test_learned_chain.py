@@ -37,6 +37,25 @@ def test_more_brown_caps_among_rubble_are_found_than_by_the_net_alone_and_refitt
     assert away < 0.7 * before
 
 
+def test_caps_near_the_camera_are_found_where_the_largest_radius_is_left_to_depth() -> None:
+    found = {}
+    for name, net, detector in (("fixed", 60, 80), ("by depth", None, None)):
+        detect = PhaseHough(radius_px=(8, detector), min_score=0.2, use_learned=True)
+        stage = CapNet(radius_px=(8, net), min_score=0.05, beside_depth=0.8)
+        score = Score()
+        for seed, color in ((91, "brown"), (92, "white"), (93, "brown")):
+            near = {"distance": 0.25, "size_mm": (45, 75), "count": 12, "cap_color": color}
+            frame = simulated(seed, width=640, height=480, shape_family="b", **near)
+            truth = frame.attached[TRUTH_TOPIC]
+            _, _, circles = CapFit(min_score=0.5).process(
+                frame, detect.process(frame, *stage.process(frame))
+            )
+            score.add(circles, truth, counted(truth, 60, 200))
+        found[name] = score
+    assert found["by depth"].recall > 0.9
+    assert found["by depth"].recall > found["fixed"].recall + 0.2
+
+
 @pytest.mark.parametrize("learned", [False, True])
 def test_what_is_hardly_a_cap_changes_nothing_about_those_that_are_likely(learned: bool) -> None:
     settings = {"soil": 3.0, "rubble": 50, "stumps": 5, "count": 60, "cluster": 1.0}

@@ -85,11 +85,11 @@ def test_dim_wood_on_wood_is_found_where_it_stands() -> None:
     frame = recorded("desk-july")[0]
     labels = orjson.loads((field_data() / "desk-july.labels.json").read_bytes())
     boxes = np.array([cap["bbox"] for cap in labels["frames"][0]["caps"]])
-    mask, learned = CapNet(radius_px=(8, 60), min_score=0.05).process(frame)
+    mask, learned = CapNet(radius_px=(8, None), min_score=0.05).process(frame)
     fit = CapFit(depth_bias_mm=2.85, min_score=0.5)
     on_cap = {}
     for blobs in (False, True):
-        detector = PhaseHough(radius_px=(8, 80), min_score=0.2, use_learned=True, use_blobs=blobs)
+        detector = PhaseHough(radius_px=(8, None), min_score=0.2, use_learned=True, use_blobs=blobs)
         circles = fit.process(frame, detector.process(frame, mask, learned))[2]
         inside = (circles.center[:, None] >= boxes[:, :2]) & (
             circles.center[:, None] <= boxes[:, :2] + boxes[:, 2:]

@@ -153,7 +153,7 @@ def test_without_a_pose_there_is_no_tilt_to_speak_of() -> None:
 def test_a_range_of_radii_that_no_image_shows_is_refused() -> None:
     with pytest.raises(ValidationError, match="is it in px"):
         CapNet(radius_px=(0.02, 0.06))
-    assert CapNet(radius_px=(2, 10)).scale() == 3.5
+    assert CapNet(radius_px=(2, 10)).scaling(first("first-bed"))[0] == 3.5
 
 
 def test_a_range_of_heights_has_a_lower_and_an_upper_end() -> None:

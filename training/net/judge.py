@@ -68,9 +68,9 @@ def simulated(models: list[Path], cases: Iterator[Case], peers: bool) -> str:
 
 def both(frame: RgbdFrame, depth: bool, beside_depth: float = 0.8) -> Circles:
     """Return the circles of network and classic detector, as graphs/pick.yaml has them."""
-    net = CapNet(radius_px=(8, 60), min_score=0.05, beside_depth=beside_depth)
+    net = CapNet(radius_px=(8, None), min_score=0.05, beside_depth=beside_depth)
     frame = frame if depth else replace(frame, depth=None)
-    stage = PhaseHough(radius_px=(8, 80), min_score=judge.LEAST, use_learned=True)
+    stage = PhaseHough(radius_px=(8, None), min_score=judge.LEAST, use_learned=True)
     return judge.kept(frame, stage.process(frame, *net.process(frame)))
 
 
