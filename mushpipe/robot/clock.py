@@ -97,7 +97,8 @@ class Lateness:
     """How late the frames of a camera arrive whose clock is its own, beyond what is usual.
 
     The least delay so far counts as none. It may grow, as the clocks drift apart; a delay that
-    grows faster comes from a queue or from a computer that stood still.
+    grows faster comes from a queue or from a computer that stood still. It may shrink as slowly,
+    where the camera's clock is the faster one, without a frame being called quick.
 
     The first frames may have waited, too, and so may those after the clock was set. They count as
     infinitely late until frames have come at the camera's pace for `PACED_S`: out of a queue that
@@ -105,7 +106,7 @@ class Lateness:
     """
 
     def __init__(self) -> None:
-        self._anchor_ns, self._own_s, self._delay = 0, inf, inf
+        self._anchor_ns, self._own_s, self._delay = 0, 0.0, inf
         self._least = self._quickest = inf
         self._paced_from = 0.0
 
@@ -120,14 +121,15 @@ class Lateness:
             arrived_s: Monotonic time of its arrival.
         """
         own_s, anchor_ns = own_ms / 1e3, stamp_ns - round(own_ms * 1e6)
-        delay = arrived_s - own_s
+        delay, drift = arrived_s - own_s, DRIFT * abs(own_s - self._own_s)
         lost = abs(anchor_ns - self._anchor_ns) > 1e6 or own_s < self._own_s
         if lost:
             self._least = inf
         if lost or self._delay - delay > SET_S:
             self._quickest = inf
-        if delay < self._quickest - TOLERANCE_S:
+        if delay < self._quickest - drift - TOLERANCE_S:
             self._quickest, self._paced_from = delay, arrived_s
-        self._least = min(delay, self._least + DRIFT * abs(own_s - self._own_s))
+        self._quickest = max(min(delay, self._quickest), self._quickest - drift)
+        self._least = min(delay, self._least + drift)
         self._anchor_ns, self._own_s, self._delay = anchor_ns, own_s, delay
         return delay - self._least if arrived_s - self._paced_from >= PACED_S else inf

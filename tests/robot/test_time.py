@@ -213,6 +213,16 @@ def test_a_camera_whose_clock_drifts_is_late_by_its_queue_alone(
     assert lateness.of(0.0, 2 * 10**18, now + 500) == inf
 
 
+@pytest.mark.parametrize("ppm", [-150, -50, 20, 50, 150])
+def test_a_camera_whose_clock_is_quick_or_slow_is_on_time_all_day(ppm: float) -> None:
+    lateness, late = Lateness(), []
+    for number in range(2 * 3600 * 5):  # five frames a second, with up to 4 ms of jitter
+        moment = number / 5
+        own = moment * (1 + ppm * 1e-6)
+        late.append(lateness.of(1e3 * own, round(1e9 * own), 50 + moment + number % 5 / 1000))
+    assert max(late[3 * 5 :]) <= 0.005
+
+
 @given(
     jump=st.floats(0.6, 10) | st.floats(-10, 0),
     queue=st.floats(0, 10),
