@@ -183,11 +183,18 @@ def quaternion_from_axis(axis: Array) -> Array:
         shortest rotation; half a turn about x is returned for it.
     """
     x, y, z = axis[:, 0], axis[:, 1], axis[:, 2]
-    # q = (z_hat x axis, 1 + z_hat . axis), normalised
+    # q = (z_hat x axis, 1 + z_hat . axis), normalised; next to -z what its length lacks would count
+    w = np.where(z < -1 + 1e-6, lengths(axis), 1.0) + z
     q = np.zeros((len(axis), 4))
-    q[:, 0], q[:, 1], q[:, 3] = -y, x, 1 + z
-    q[z < -1 + 1e-12] = [1.0, 0.0, 0.0, 0.0]
+    q[:, 0], q[:, 1], q[:, 3] = -y, x, w
+    q[w < 1e-12] = [1.0, 0.0, 0.0, 0.0]
     return q / lengths(q)[:, None]
+
+
+def axis_from_quaternion(quaternion: Array) -> Array:
+    """Return where unit quaternions (N, 4), x y z w, turn +z to: (N, 3); rows of NaN stay NaN."""
+    x, y, z, w = quaternion.T
+    return np.column_stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
 
 
 def lengths(vectors: Array) -> Array:

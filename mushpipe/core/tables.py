@@ -14,6 +14,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from mushpipe.core.geometry import axis_from_quaternion
+
+AXIS_TOLERANCE = 1e-3
 Floats = NDArray[np.float64]
 
 
@@ -217,13 +220,19 @@ class Poses(Columns):
     valid: NDArray[np.bool_] = column(dtype=np.bool_)
 
     def check(self) -> None:
-        """Quaternion, axis and apex are known exactly where valid; both former have length 1."""
+        """Quaternion, axis and apex are known exactly where valid; both former have length 1.
+
+        And the quaternion turns +z to the axis: a robot may go by either.
+        """
         for name in ("quaternion", "axis", "apex"):
             known = _known(getattr(self, name))
             self._require(known == self.valid, f"{name} must be finite exactly where valid")
         for name in ("quaternion", "axis"):
             square = np.einsum("ij,ij->i", getattr(self, name), getattr(self, name))
             self._require(~(np.abs(square - 1) > 2e-6), f"{name} must have length 1")
+        away = np.abs(axis_from_quaternion(self.quaternion) - self.axis)
+        text = "the quaternion, x y z w, must turn +z to the axis, out of the cap"
+        self._require(~(away > AXIS_TOLERANCE), text)
         self._require(~(self.sigma_rad < 0), "a sigma must not be negative")
 
 

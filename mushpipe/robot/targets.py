@@ -15,7 +15,8 @@ import orjson
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from mushpipe.core.tables import DepthSource, PickFlag, Picks
+from mushpipe.core.geometry import axis_from_quaternion
+from mushpipe.core.tables import AXIS_TOLERANCE, DepthSource, PickFlag, Picks
 
 Reason = Literal["no_depth", "estimated", "invalid", "workspace", "claimed", "limit"]
 REASONS: tuple[Reason, ...] = ("no_depth", "estimated", "invalid", "workspace", "claimed", "limit")
@@ -157,6 +158,9 @@ def _valid(table: _Table) -> Bools:
     for direction in (table.quaternion, table.axis):
         unit = np.abs(np.linalg.norm(direction, axis=1) - 1) <= UNIT_TOLERANCE
         good &= unit | ~table.oriented
+    # A robot may go by either.
+    away = np.abs(axis_from_quaternion(table.quaternion) - table.axis).max(axis=1)
+    good &= (away <= AXIS_TOLERANCE) | ~table.oriented
     return np.asarray(good)
 
 

@@ -9,7 +9,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from mushpipe import Camera, quaternion_from_axis
-from mushpipe.core.geometry import brown, brown_inverse
+from mushpipe.core.geometry import axis_from_quaternion, brown, brown_inverse
 
 LENS = (0.12, -0.25, 0.001, -0.002, 0.09)
 SIZE = (640, 480, 617.0, 612.0, 322.5, 238.25)
@@ -172,6 +172,15 @@ def test_quaternions_take_z_to_the_axis_without_spin(vectors):
     assert (quaternion[:, 2] == 0).all()
 
 
+@given(arrays(np.float64, (7, 4), elements=st.floats(-1, 1)))
+def test_axes_are_where_quaternions_turn_z_to(numbers):
+    length = np.linalg.norm(numbers, axis=1)
+    quaternion = numbers[length > 1e-3] / length[length > 1e-3, None]
+    wanted = [Rotation.from_quat(q).apply([0, 0, 1]) for q in quaternion]
+    found = axis_from_quaternion(quaternion)
+    np.testing.assert_allclose(found, np.reshape(wanted, (-1, 3)), atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("axis", "quaternion"),
     [
@@ -179,6 +188,7 @@ def test_quaternions_take_z_to_the_axis_without_spin(vectors):
         ([0, 0, -1], [1, 0, 0, 0]),
         ([1, 0, 0], [0, np.sqrt(0.5), 0, np.sqrt(0.5)]),
         ([0, 1, 0], [-np.sqrt(0.5), 0, 0, np.sqrt(0.5)]),
+        ([0, 0, -0.9999999], [1, 0, 0, 0]),  # of a normal in single precision
         ([np.nan] * 3, [np.nan] * 4),
     ],
 )

@@ -144,6 +144,11 @@ WRONG = [
         "Poses: quaternion must have length 1 (row 0)",
     ),
     (poses, {"axis": [[0, 1, 1], [NAN] * 3]}, "Poses: axis must have length 1 (row 0)"),
+    (
+        poses,
+        {"quaternion": [[1, 0, 0, 0], [NAN] * 4]},  # w x y z
+        "Poses: the quaternion, x y z w, must turn +z to the axis, out of the cap (row 0)",
+    ),
     (picks, {"id": [7, 7]}, "Picks: ids must be unique (row 1)"),
     (picks, {"position": np.ones((2, 3))}, "Picks: position must be NaN where missing (row 1)"),
     (picks, {"surface": np.ones((2, 3))}, "Picks: surface must be NaN where missing (row 1)"),

@@ -120,7 +120,7 @@ def tables(draw: st.DrawFn) -> Columns:
     known = np.array(draw(st.lists(st.booleans(), min_size=n, max_size=n)), bool)
     score = np.array(draw(st.lists(st.floats(0, 1), min_size=n, max_size=n)))
     position = np.where(known[:, None], np.nan_to_num(draw(unknown(n, 3))), np.nan)
-    axis = np.where(known[:, None], [0.0, 0.6, 0.8], np.nan)
+    axis = np.where(known[:, None], [0.28, 0.0, 0.96], np.nan)
     quaternion = np.where(known[:, None], [0.1, 0.1, 0.7, 0.7], np.nan)
     kind = draw(st.sampled_from([Circles, Locations, Poses, Picks, Truth]))
     source = np.where(known, DepthSource.MEASURED, DepthSource.MISSING)

@@ -116,6 +116,7 @@ def test_an_orientation_that_is_missing_without_a_flag_is_flagged() -> None:
         {"diameter": [-0.04, 0.04]},
         {"quaternion": [[2, 0, 0, 0], [1, 0, 0, 0]]},
         {"axis": [[0, 0, -3], [0, 0, -1]]},
+        {"axis": [[0, 0, 1], [0, 0, -1]]},  # not where the quaternion turns +z to
         {"sigma_position": [[INF, 0, 0], [0, 0, 0]]},
         {"sigma_tilt": [-1, 0]},
         {"position": [[1e9, 0, 0.5], [0, 0, 0.5]]},
