@@ -17,8 +17,9 @@ class RobotClient:
     """A connection to the robot socket; use it in a ``with`` block.
 
     After ``timeout_s`` without a line the server counts as dead and every method raises OSError.
-    ``late_ms`` is how much later the last line came than the quickest one of this connection: what
-    a network or our own slowness held back, which in mode ``stream`` counts towards ``valid_ms``.
+    ``late_ms`` is how much later the last line came than the quickest one since the last answer to
+    a request of ours, or than that request: what a network or our own slowness held back, which in
+    mode ``stream`` counts towards ``valid_ms``. Two clocks drift apart: there, `ping` each minute.
 
     Raises:
         OSError: The server cannot be reached, is silent, or has gone.
@@ -34,13 +35,15 @@ class RobotClient:
         tls: ssl.SSLContext | None = None,
         **hello: Any,
     ) -> None:
+        begun_ms = time.monotonic() * 1000
         self._socket = socket.create_connection((host, port), timeout_s)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         if tls is not None:
             self._socket = tls.wrap_socket(self._socket, server_hostname=host)
         self._lines = self._socket.makefile("rb")
         self._id = 0
-        self._quickest_ms = math.inf
+        self._asked = 0, begun_ms  # the last request's id, and when it was made; 0 is hello's
+        self._ahead_ms = math.inf  # our clock, before the server's t_ms
         self.late_ms = 0.0
         self.hello = self.receive()
         if self.hello["op"] == "hello" and not str(self.hello.get("version")).startswith("1."):
@@ -71,19 +74,30 @@ class RobotClient:
                 f"this is no robot socket of mushpipe: it says {line[:60]!r}"
             ) from None
         if "t_ms" in message:
-            delay_ms = time.monotonic() * 1000 - message["t_ms"]
-            self._quickest_ms = min(self._quickest_ms, delay_ms)
-            self.late_ms = delay_ms - self._quickest_ms
+            ahead_ms = time.monotonic() * 1000 - message["t_ms"]
+            self._ahead_ms = min(self._ahead_ms, ahead_ms)
+            if (0 if message["op"] == "hello" else message.get("id")) == self._asked[0]:
+                self._ahead_ms = self._asked[1] - message["t_ms"]
+            self.late_ms = ahead_ms - self._ahead_ms
         return message
+
+    def ping(self) -> None:
+        """Say that we live, and have the clocks compared by the pong among the lines to come."""
+        self._request("ping")
 
     def ask(self, op: str, **fields: Any) -> Message:
         """Send a request and return its answer, passing over heartbeats and streamed targets."""
-        self._id += 1
-        self.send(op, id=self._id, **fields)
+        number = self._request(op, **fields)
         while True:
             message = self.receive()
-            if message.get("id") == self._id or message["op"] == "bye" or message.get("fatal"):
+            if message.get("id") == number or message["op"] == "bye" or message.get("fatal"):
                 return message
+
+    def _request(self, op: str, **fields: Any) -> int:
+        self._id += 1
+        self._asked = self._id, time.monotonic() * 1000
+        self.send(op, id=self._id, **fields)
+        return self._id
 
     def targets(self, **fields: Any) -> list[Message]:
         """Return what may be picked now, best first; nothing where the server has nothing fresh."""

@@ -125,7 +125,10 @@ def _talk(
         while not count or shown[0] < count:
             if mode is Mode.stream:
                 message = connection.receive()
-                connection.send("heartbeat")
+                if message["op"] == "heartbeat":
+                    connection.ping()
+                elif message["op"] == "pong":
+                    continue
             else:
                 message = connection.ask("get_targets", **asked)
             _show(message, raw)

@@ -81,11 +81,12 @@ def test_the_reference_client_is_killed_and_comes_back() -> None:
             assert message["seq"] == 3
 
 
-def serve_lines(listening: socket.socket, lines: list[dict[str, Any]]) -> None:
+def serve_lines(listening: socket.socket, lines: list[dict[str, Any]], heard: int = 1) -> None:
     connection, _ = listening.accept()
     with connection:
         connection.sendall(b"".join(json.dumps(line).encode() + b"\n" for line in lines))
-        connection.recv(65536)
+        for _ in range(heard):
+            connection.recv(65536)
 
 
 class Cable:
@@ -164,3 +165,43 @@ def test_the_reference_client_sees_what_a_slow_network_held_back() -> None:
         with RobotClient(port=listening.getsockname()[1]) as robot:
             fresh, late = [robot.receive() and robot.late_ms for _ in range(2)]
     assert late - fresh >= 600
+
+
+def test_a_stream_of_hours_over_clocks_that_drift_is_not_taken_for_late(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The robot's clock gains 180 ms in an hour; a line takes 2 ms, in the end 302."""
+    hours = 3_600_000
+    lines: list[dict[str, Any]] = [
+        {"op": "hello", "version": "1.0", "t_ms": 0},
+        {"op": "heartbeat", "t_ms": 0},
+        {"op": "targets", "t_ms": hours},
+        {"op": "pong", "id": 1, "t_ms": hours},
+        {"op": "targets", "t_ms": hours + 100},
+        {"op": "pong", "id": 2, "t_ms": hours + 200},
+        {"op": "targets", "t_ms": hours + 300},
+    ]
+    now_ms = 0.0
+    monkeypatch.setattr(
+        "mushpipe.robot.client.time.monotonic", lambda: 7 + now_ms * (1 + 50e-6) / 1000
+    )
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        threading.Thread(target=serve_lines, args=(listening, lines, 9), daemon=True).start()
+        with RobotClient(port=listening.getsockname()[1], mode="stream") as robot:
+            now_ms = hours + 2
+            assert robot.receive()["op"] == "targets"
+            assert robot.late_ms == pytest.approx(182, abs=1)  # who knows: it may have waited
+            now_ms = hours - 1
+            robot.ping()
+            now_ms = hours + 2
+            assert robot.receive()["op"] == "pong"
+            now_ms = hours + 102
+            assert robot.receive()["op"] == "targets"
+            assert robot.late_ms == pytest.approx(2, abs=2)
+            now_ms = hours + 199
+            robot.ping()
+            now_ms = hours + 502
+            assert robot.receive()["op"] == "pong"
+            now_ms = hours + 602
+            assert robot.receive()["op"] == "targets"
+            assert robot.late_ms == pytest.approx(302, abs=2)  # though no line was quicker
