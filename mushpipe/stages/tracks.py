@@ -128,13 +128,14 @@ def _assign(distances: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 def _moved(old: Sightings, new: Sightings, image: tuple[int, int]) -> tuple[Sightings, Floats]:
     """Return the old mushrooms where they are expected now, and how far that is from the new ones.
 
-    They are expected where they were, unless they all shifted: unless a shift brings at least half
-    of those still in view, and more than no shift does, onto new ones.
+    They are expected where they were, unless they all shifted: unless most are not where they were,
+    and a shift brings at least half of those still in view, and more than no shift does, onto new
+    ones. In a row of caps that is one pitch, where one end is picked and the other comes to light.
     """
     flat = _flat(new, old)
     stayed = (flat <= 1).any(axis=0).sum()
     fewer = min(len(new), len(old))
-    if fewer < FEWEST or (stayed > 0.9 * fewer and _at_rest(new, old)):
+    if fewer < FEWEST or _at_rest(new, old):
         return old, flat
     shifted = replace(old, center=old.center + _common_shift(new, old))
     apart = _flat(new, shifted)

@@ -154,3 +154,15 @@ def test_after_a_turn_to_another_bed_ids_follow_its_shifts_at_once() -> None:
         rows = [(u + 10.0 * step, v, 0.5) for u, v in second]
         names.append(tracks.update(*seen(*rows), (320, 240), 1 + step, 10**9).tolist())
     assert names[1:] == names[:1] * 3
+
+
+def test_a_row_that_loses_one_end_and_gains_the_other_has_not_shifted_by_a_pitch() -> None:
+    """The first is picked; a fourth comes to light at once, or while that one is remembered."""
+    row = [(40 + 17.0 * i, 60.0, 0.5) for i in range(4)]
+    tracks = Tracks()
+    assert ids(tracks, *row[:3]) == [0, 1, 2]
+    assert ids(tracks, *row[1:], at=1) == [1, 2, 3]
+    tracks = Tracks()
+    ids(tracks, *row[:3])
+    assert ids(tracks, *row[1:3], at=1) == [1, 2]
+    assert ids(tracks, *row[1:], at=2) == [1, 2, 3]
