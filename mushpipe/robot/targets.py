@@ -28,6 +28,7 @@ _SOURCES = {int(source): source.name.lower() for source in DepthSource}
 UNIT_TOLERANCE = 1e-3
 # Beyond these a number is not a measurement.
 FARTHEST_M, SMALLEST_M = 100.0, 0.0001
+ID_LIMIT = 10**15  # an acknowledgement has no place for more digits
 
 
 class Workspace(BaseModel):
@@ -152,7 +153,8 @@ def _valid(table: _Table) -> Bools:
     sigmas = np.column_stack([table.sigma_position, table.sigma_diameter, table.sigma_tilt])
     good = ~(np.isinf(sigmas) | (sigmas < 0)).any(axis=1)
     good &= (np.abs(table.position) <= FARTHEST_M).all(axis=1)
-    good &= (table.score >= 0) & (table.score <= 1) & (table.id >= 0)
+    good &= (table.score >= 0) & (table.score <= 1)
+    good &= (table.id >= 0) & (table.id < ID_LIMIT)
     sized = (table.diameter >= SMALLEST_M) & (table.diameter <= FARTHEST_M)
     good &= sized | np.isnan(table.diameter)
     for direction in (table.quaternion, table.axis):

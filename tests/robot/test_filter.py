@@ -121,6 +121,7 @@ def test_an_orientation_that_is_missing_without_a_flag_is_flagged() -> None:
         {"sigma_tilt": [-1, 0]},
         {"position": [[1e9, 0, 0.5], [0, 0, 0.5]]},
         {"id": [-1, 1]},
+        {"id": [10**15, 1]},  # a hash, which no acknowledgement could name
     ],
     ids=str,
 )
