@@ -47,8 +47,8 @@ class MakePicks(Stage):
 
     T_base_camera: TransformSetting | None = Field(
         None,
-        description="pose of the camera in the robot's frame, {frame, translation (m), quaternion "
-        "(x y z w)} or a YAML file with these; picks are given in that frame",
+        description="pose of a camera that stands still in the robot's frame, {frame, translation "
+        "(m), quaternion (x y z w)} or a YAML file with these; picks are given in that frame",
     )
     order: tuple[Rank, ...] = Field(
         ("unoccluded", "highest"),
