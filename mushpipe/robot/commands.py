@@ -57,7 +57,7 @@ def _split(address: str) -> tuple[str, int]:
     host, colon, port = address.rpartition(":")
     if not (colon and host and port.isdecimal() and 0 < int(port) < 65536):
         raise typer.BadParameter(f"'{address}' is not host:port, with a port from 1 to 65535")
-    return host, int(port)
+    return host.removeprefix("[").removesuffix("]"), int(port)
 
 
 @app.command()

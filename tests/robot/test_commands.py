@@ -134,6 +134,30 @@ def test_another_program_on_the_port_is_named() -> None:
             RobotClient(port=other.getsockname()[1])
 
 
+@pytest.mark.parametrize("written", ["[::1]:{}", "::1:{}"])
+def test_an_address_may_be_of_ipv6(monkeypatch: pytest.MonkeyPatch, written: str) -> None:
+    def give_up(_: float) -> None:
+        raise RuntimeError("it would try for ever")
+
+    monkeypatch.setattr(commands.time, "sleep", give_up)
+    try:
+        other = socket.create_server(("::1", 0), family=socket.AF_INET6)
+    except OSError:
+        pytest.skip("this computer has no IPv6")
+    with other:
+
+        def speak() -> None:
+            connection, _ = other.accept()
+            with connection:
+                connection.sendall(b'{"op":"error","code":"timeout","message":"hello from v6"}\n')
+                connection.recv(999)
+
+        threading.Thread(target=speak, daemon=True).start()
+        result = robot("client", written.format(other.getsockname()[1]))
+    assert result.exit_code == 1
+    assert "refused: timeout: hello from v6" in result.output
+
+
 @pytest.mark.parametrize(
     "arguments",
     [
