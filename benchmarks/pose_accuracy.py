@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from pose_scenes import SETS, detected, frames, true_circles, truth_of
 
-from mushpipe import Circles, Locations, Poses, RgbdFrame
+from mushpipe import Circles, Locations, Poses, RgbdFrame, quaternion_from_axis
 from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.depth_correct import DepthCorrect
 from mushpipe.stages.fuse_depth import FuseDepth
@@ -76,11 +76,8 @@ def trivial(kind: str) -> Method:
         if kind == "bed" and frame.camera:
             depth = np.fmax(frame.depth_m, np.float32(0))
             axis = np.where(np.isnan(axis), np.nan, upright("bed", depth, pixel_rays(frame.camera)))
-        n = len(circles)
-        turn = np.full((n, 4), np.nan)
+        turn, nan = quaternion_from_axis(axis), np.full(len(circles), np.nan)
         known = np.asarray(np.isfinite(axis).all(axis=1))
-        turn[known] = [0, 0, 0, 1]
-        nan = np.full(n, np.nan)
         return locations, Poses(turn, axis, locations.position, nan, nan, known)
 
     return run
