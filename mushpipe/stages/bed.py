@@ -22,6 +22,10 @@ RELIEF_M = 0.02  # largest departure of the soil from the plane
 # What lies farther above or below the surface is not bed. Caps only ever rise above it.
 RISE_M, FALL_M = 0.006, 0.018
 _FEWEST = 12
+# Below dense caps half of the cells lie on the bed; of a plane with fewer than this share is asked
+# whether it leans from the bed to a floor beside it.
+WELL_SUPPORTED, CLEARLY = 0.4, 1.1  # and how much more another must have to take its place
+WIDEST = 2.0  # misfit that a fit to a part of the image reaches for: caps, but no floor
 _REACH_CELLS = 2.5
 
 
@@ -113,25 +117,86 @@ def fit_plane(points: Floats) -> Floats | None:
 def _biweight(points: Floats) -> Floats:
     """Solve 1 / z = a + b x + c y for points (N, 3) by reweighting, from weights of 1.
 
+    Where few points lie on that plane it is looked for from parts of them, too; of the planes found
+    it is the one on which the most lie.
+
     Returns:
         (3,) NaN where too few are known.
     """
-    normal, solution = np.empty((3, 3)), np.zeros(3)
+    solution, other = np.zeros(3), np.zeros(3)
     basis, scale = _basis(points)
     if len(basis) < _FEWEST:
         solution[:] = np.nan
         return solution
+    weight = np.ones(len(basis))
+    support = _reweigh(basis, weight, np.inf, solution)
+    for part in range(9 if support < WELL_SUPPORTED else 0):
+        if not _weigh_part(basis, part, weight):
+            continue
+        found = _reweigh(basis, weight, WIDEST, other)
+        if found > CLEARLY * support:
+            support = found
+            solution[:] = other
+    solution[1:] /= scale
+    return solution
+
+
+@jit
+def _weigh_part(basis: Floats, part: int, weight: Floats) -> bool:
+    """Fill weights (N,) with 1 in a quarter, a half or the middle of the image, 0 elsewhere.
+
+    Args:
+        basis: (N, 4) from `_basis`.
+        part: 0 to 8, row by row: left, any or right of the upper half, of any, of the lower half;
+            any is the inner half.
+        weight: Out.
+
+    Returns:
+        Whether there are enough points in that part.
+    """
+    x, y = basis[:, 1], basis[:, 2]
+    left, top, right, bottom = x.min(), y.min(), x.max(), y.max()
+    count = 0
+    for m in range(len(basis)):
+        across = (2 * x[m] - left - right) / max(right - left, 1e-9)  # -1..1
+        down = (2 * y[m] - top - bottom) / max(bottom - top, 1e-9)
+        column, row = part % 3 - 1, part // 3 - 1
+        beside = abs(across) < 0.5 if column == 0 else column * across > 0
+        below = abs(down) < 0.5 if row == 0 else row * down > 0
+        inside = beside and below
+        weight[m] = 1.0 if inside else 0.0
+        count += inside
+    return count >= _FEWEST
+
+
+@jit
+def _reweigh(basis: Floats, weight: Floats, widest: float, solution: Floats) -> float:
+    """Reweigh until the solution rests.
+
+    Args:
+        basis: (N, 4) from `_basis`.
+        weight: (N,) to start with, in and out.
+        widest: Largest misfit of what still counts.
+        solution: (3,) out.
+
+    Returns:
+        Share of the points that lies on the plane, each by its weight.
+    """
     z = basis[:, 3]
-    inverse, misfit, weight = 1 / z, np.empty(len(z)), np.ones(len(z))
+    inverse, misfit, normal = 1 / z, np.empty(len(z)), np.empty((3, 3))
     for _ in range(20):
         if _step(basis, inverse, weight, normal, solution) < 1e-4:  # 1/m
             break
         _misfits(basis, z, solution, misfit)
-        spread = max(1.0, 1.5 * np.median(misfit))  # wide while most does not fit
+        # wide while most does not fit
+        spread = max(1.0, min(widest, 1.5 * np.median(misfit)))
         for m in range(len(z)):
             weight[m] = max(0.0, 1 - (misfit[m] / spread) ** 2) ** 2 + 1e-6
-    solution[1:] /= scale
-    return solution
+    _misfits(basis, z, solution, misfit)
+    support = 0.0
+    for m in range(len(z)):
+        support += max(0.0, 1 - misfit[m] ** 2) ** 2
+    return support / len(z)
 
 
 @jit

@@ -55,6 +55,29 @@ def test_the_bed_is_found_below_caps_beside_a_rim_and_a_hole(
     assert np.degrees(np.arccos(found @ normal)) < 0.7
 
 
+@pytest.mark.parametrize("drop", [0.05, 0.2, 0.8])  # m
+@pytest.mark.parametrize("share", [0.2, 0.3])
+@pytest.mark.parametrize("where", ["right", "both sides", "corner", "diagonal"])
+def test_a_floor_beside_the_bed_does_not_turn_it(where: str, share: float, drop: float) -> None:
+    normal = normal_of(8, 130)
+    depth, bed = crowded(5, normal, 40)
+    x, y = U / 320, V / 240
+    beside = {
+        "right": x > 1 - share,
+        "both sides": np.abs(2 * x - 1) > 1 - share,
+        "corner": np.maximum(x, y) < np.sqrt(share),
+        "diagonal": x + y < np.sqrt(2 * share),
+    }[where]
+    floor = -(0.45 + drop) / (RAY @ normal)
+    depth[beside] = floor[beside] + np.random.default_rng(0).normal(0, 0.002, beside.sum())
+    found = bed_normal(np.nan_to_num(depth), RAYS)
+    assert found is not None
+    assert np.degrees(np.arccos(found @ normal)) < 1.0
+    plane = bed_depth(depth, relief=False)
+    assert plane is not None
+    assert np.median(np.abs(plane - bed)) < 0.003
+
+
 def test_the_fit_takes_rays_and_pixels_alike() -> None:
     bed = (-0.45 / (RAY @ normal_of(15, 30))).astype(np.float32)
     rays = np.dstack([RAYS, bed])[::8, ::8]
