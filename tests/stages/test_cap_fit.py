@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
 from mushpipe import Camera, Circles, DepthSource, Locations, Poses
@@ -57,6 +58,23 @@ def test_an_exact_cap_is_recovered_wherever_it_is_and_however_it_leans(
     u, v = np.rint(circles_of([true]).center[0]).astype(int)
     assert locations.position[0, 2] == pytest.approx(depth[v, u], abs=3e-4)
     assert locations.source[0] == DepthSource.MEASURED
+
+
+@pytest.mark.parametrize("wider", [2, 3])
+def test_edge_offset_puts_caps_right_that_a_stereo_camera_shows_larger(wider: int) -> None:
+    bed, caps = (
+        0.44,
+        [cap(8, turn, (x, 0.0, 0.4), 0.02, 0.6) for turn, x in ((20, -0.06), (90, 0.05))],
+    )
+    depth, gray = draw(caps, bed)
+    away, nearest = distance_transform_edt(depth == bed, return_indices=True)
+    depth = np.where(away <= wider, depth[tuple(nearest)], depth)
+    worst = {}
+    for offset in (0.7, -float(wider)):
+        stage = CapFit(up="camera", edge_offset_px=offset)
+        locations = stage.process(frame_from(depth, gray), circles_of(caps))[0]
+        worst[offset] = 1e3 * np.abs(locations.diameter - 0.04).max()
+    assert worst[-float(wider)] < 0.6 < worst[0.7]  # mm
 
 
 def test_sigmas_and_fitness_are_positive_and_the_quaternion_turns_z_onto_the_axis() -> None:
