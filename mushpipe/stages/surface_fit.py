@@ -78,12 +78,14 @@ class SurfaceFit(Stage):
         whole = np.minimum(own / (WHOLE * len(CELLS)), 1) ** 2
         sigma_diameter = np.hypot(sigma_diameter, 2 * pixel) / np.maximum(whole, 1e-3)
         known = np.isfinite(position).all(axis=1)
+        # a depth that is off moves the point along its ray, off the optical axis sideways as well
+        sideways = np.sqrt(pixel[:, None] ** 2 + ray[:, :2] ** 2 * along[:, None])
         return Locations(
             position=position,
             distance=lengths(position),
             diameter=diameter,
             source=np.where(known, sources(circles, depth), DepthSource.MISSING),
-            sigma_position=np.column_stack([pixel, pixel, np.sqrt(along)]),
+            sigma_position=np.column_stack([sideways, np.sqrt(along)]),
             sigma_diameter=sigma_diameter,
         )
 

@@ -124,6 +124,21 @@ def test_a_centre_that_shows_an_undetected_cap_is_in_doubt(stage: SurfaceFit | C
     assert abs(error) > 0.01
 
 
+@pytest.mark.parametrize("stage", [SurfaceFit(), CapFit(up="camera")])
+@pytest.mark.parametrize("x", [-0.16, 0.16])
+def test_that_doubt_lies_along_the_ray(stage: SurfaceFit | CapFit, x: float) -> None:
+    low = cap(0, 0, (x, 0, 0.48), 0.022, 0.6)
+    high = cap(0, 0, (x * 0.45 / 0.48 - np.copysign(0.009, x), 0, 0.45), 0.016, 0.6)
+    circles = circles_of([low])
+    found = stage.process(frame_from(draw([low, high], BED)[0], GRAY), circles)
+    located = found if isinstance(found, Locations) else found[0]
+    v, u = np.rint(circles.center[0][::-1]).astype(int)
+    own = CAMERA.deproject(circles.center, draw([low], BED)[0][[v], [u]])
+    error, sigma = located.position[0] - own[0], located.sigma_position[0]
+    assert abs(error[0]) > 0.005
+    assert (abs(error) < 3 * sigma).all()
+
+
 def test_noise_stays_below_the_stated_sigma_and_moves_nothing() -> None:
     circles, depth = circles_of(CAPS), draw(CAPS, BED)[0]
     clean, rng = locate(depth, circles), np.random.default_rng(0)
