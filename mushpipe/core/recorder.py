@@ -64,6 +64,7 @@ class RecordingWriter:
             use_chunking=not stream,
             index_types=IndexType.NONE if stream else IndexType.ALL,
             enable_crcs=True,
+            enable_data_crcs=stream,  # messages without a chunk have no CRC but that of them all
         )
         self._writer.start(profile="mushpipe", library="mushpipe")
         self._schemas: dict[tuple[str, str], int] = {}

@@ -25,7 +25,7 @@ from mcap.records import (
     Statistics,
 )
 from mcap.records import Message as McapMessage
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 from mcap.summary import Summary
 from zstandard import ZstdError
 
@@ -139,8 +139,10 @@ class RecordingReader:
     ) -> Iterator[McapRecord]:
         with self.path.open("rb") as file:
             limit = self.path.stat().st_size
-            reader = StreamReader(file, emit_chunks=True, record_size_limit=limit)
-            in_summary = False
+            reader = StreamReader(
+                file, emit_chunks=True, validate_crcs=True, record_size_limit=limit
+            )
+            in_summary = loose = False
             try:
                 for record in reader.records:
                     # What the summary repeats was read already; it goes on to the last byte.
@@ -148,11 +150,16 @@ class RecordingReader:
                     if in_summary:
                         continue
                     if not isinstance(record, Chunk):
+                        loose |= isinstance(record, McapMessage)
                         yield record
                     elif wanted(record):
                         yield from self._unpack(record, as_written)
             except InvalidMagic:
                 self._note("its last bytes are missing")
+            except CRCValidationError:
+                # Of all chunks and what stands between them; chunks have CRCs of their own.
+                if loose:
+                    self._note("bytes of it have changed (its CRC does not match)")
             except GARBAGE:
                 self._note("it breaks off: the recorder did not close it, or bytes are missing")
 

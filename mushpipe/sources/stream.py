@@ -17,7 +17,7 @@ from typing import Any
 
 from mcap.exceptions import InvalidMagic
 from mcap.records import Channel, McapRecord, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader
+from mcap.stream_reader import CRCValidationError, StreamReader
 from pydantic import PrivateAttr
 
 from mushpipe.core import wire
@@ -166,6 +166,8 @@ class _Messages:
                 elif isinstance(record, Message):
                     channel = channels[record.channel_id]
                     yield Raw(channel, schemas.get(channel.schema_id), record)
+        except CRCValidationError:
+            self.damage = "has changed on its way: its CRC does not match"
         except GARBAGE as error:
             self.damage = f"broke off: its sender did not end it ({type(error).__name__})"
 

@@ -163,10 +163,13 @@ def write_foxglove(
     frames: int,
     chunk_size: int | None = 1,
     compression: MCAPCompression | None = MCAPCompression.Zstd,
+    use_chunks: bool = True,
 ) -> Path:
     """Write the frames of `rgbd` as Foxglove messages; chunk_size 1 puts each in its own chunk."""
     context = foxglove.Context()
-    options = MCAPWriteOptions(compression=compression, chunk_size=chunk_size)
+    options = MCAPWriteOptions(
+        compression=compression, chunk_size=chunk_size, use_chunks=use_chunks
+    )
     with foxglove.open_mcap(path, context=context, writer_options=options):
         for topic, log_time, message in foxglove_entries(frames):
             channel = getattr(foxglove.channels, f"{type(message).__name__}Channel")

@@ -128,6 +128,20 @@ def test_a_corrupt_chunk_costs_only_its_own_message(
     assert f"{len(frames)} frames could be read" in str(error)
 
 
+def test_flipped_bits_of_messages_without_chunks_are_reported(tmp_path: Path) -> None:
+    """They have no CRC but that of all data, which is known to be wrong only at its end."""
+    path = write_foxglove(tmp_path / "a.mcap", FRAMES, use_chunks=False)
+    data = bytearray(path.read_bytes())
+    assert drain(McapSource(path=path))[1] is None
+    for i in range(FRAMES):
+        data[data.index(color_pixels(i).tobytes()) + 7] ^= 1
+    path.write_bytes(data)
+    frames, error = drain(McapSource(path=path))
+    assert not any(map(same_as_written, frames))
+    assert error is not None
+    assert "its CRC does not match" in str(error)
+
+
 def test_a_damaged_index_costs_nothing_but_is_reported(whole: Path, tmp_path: Path) -> None:
     data = bytearray(whole.read_bytes())
     # The topics are named twice: in a compressed chunk, and in the clear in the index.

@@ -226,6 +226,19 @@ def test_a_stream_that_was_saved_is_a_recording(tmp_path: Path) -> None:
     assert [list(f.attached) for f in saved] == [list(f.attached) for f in sent] == [["/clock"]] * 3
 
 
+def test_a_saved_stream_in_which_a_bit_is_flipped_is_reported(tmp_path: Path) -> None:
+    path = tmp_path / "saved.mcap"
+    code = "import sys; from tests.io.test_stream_source import send; send()"
+    with path.open("wb") as file:
+        subprocess.run([sys.executable, "-c", code], stdout=file, check=True)
+    data = bytearray(path.read_bytes())
+    data[data.index(picture(0)[0].tobytes()) + 7] ^= 1
+    path.write_bytes(data)
+    for source in (McapSource(path=path), opened(path)):
+        with pytest.raises(InputError, match=r"its CRC does not match\)?; 3 frames"):
+            list(source.frames())
+
+
 def send() -> None:
     writer = RecordingWriter(STDIO, {MANIFEST: {"json": "{}"}})
     for number in (0, 1, 5):
