@@ -77,7 +77,7 @@ class RecordingReader:
     in words, what could not be read.
 
     Raises:
-        UsageError: There is no such file.
+        UsageError: There is no such file, or it is a pipe.
         InputError: It is empty, or not MCAP at all.
     """
 
@@ -85,6 +85,11 @@ class RecordingReader:
         self.path = path
         self.damage: list[str] = []
         self._index: Index | None = None
+        if path.is_fifo():  # what was read of it is gone: the rest would pass for a damaged file
+            raise UsageError(
+                f"{path}: it is a pipe, and recordings are read more than once: save it as a file; "
+                "a graph plays what is piped into 'mushpipe run GRAPH --source -'"
+            )
         try:
             with path.open("rb") as file:
                 magic = file.read(8)

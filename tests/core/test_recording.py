@@ -1,5 +1,6 @@
 """The MCAP reader on files of its own and on files that are not what they seem."""
 
+import os
 import struct
 from pathlib import Path
 
@@ -94,6 +95,13 @@ def records(data: bytes) -> list[tuple[int, int, int]]:
 
 def chunks(data: bytes) -> list[tuple[int, int]]:
     return [(begin, end) for opcode, begin, end in records(data) if opcode == 6]
+
+
+def test_a_pipe_is_no_damaged_file(tmp_path):
+    """`mushpipe info <(zstd -dc bed.mcap.zst)`: nothing is read of it, and nobody waits."""
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(UsageError, match=r"pipe: it is a pipe, .* save it as a file"):
+        RecordingReader(tmp_path / "pipe")
 
 
 def test_a_recording_cut_short_is_read_up_to_the_cut(tmp_path):
