@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from glob import escape
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Self
 
 import cv2
@@ -53,9 +53,14 @@ class ImagesSource(ReplaySource):
     @field_validator("color", "depth")
     @classmethod
     def _has_a_star(cls, value: str | None) -> str | None:
-        if value is not None and value.count("*") != 1:
+        if value is None:
+            return None
+        if value.count("*") != 1:
             raise ValueError("expected one `*` for what tells the images apart: depth/*.png")
-        return value
+        names = PurePosixPath(value)  # as paths of files are spelt: without ./ and //
+        if names.is_absolute():
+            raise ValueError("expected names as seen from the folder (path): depth/*.png")
+        return str(names)
 
     @model_validator(mode="after")
     def _has_a_scale(self) -> Self:

@@ -97,6 +97,18 @@ def test_partners_have_the_same_in_place_of_the_star(tmp_path: Path) -> None:
     }
 
 
+@pytest.mark.parametrize("folder", ["./rgb/", "rgb//", "rgb/./"])
+def test_names_may_be_spelt_as_a_shell_spells_them(folder: str, tmp_path: Path) -> None:
+    """`aa2` and `bb1` were cut to 2 and 1, which is another order."""
+    for k, name in enumerate(("aa2", "bb1")):
+        write(tmp_path / f"rgb/{name}.png", k)
+        write(tmp_path / f"depth/{name}.png", 1000 + k, np.uint16, 1)
+    names = {"color": f"{folder}*.png", "depth": "./depth/*.png"}
+    frames = played(tmp_path, **names, depth_scale=0.001)
+    assert [int(frame.color.mean()) for frame in frames] == [0, 1]
+    assert [None if f.depth is None else int(f.depth[0, 0]) for f in frames] == [1000, 1001]
+
+
 def test_channels_are_red_green_blue_and_float_depth_is_taken_as_it_is(tmp_path: Path) -> None:
     image = np.zeros((*SIZE, 3), np.uint8)
     image[..., 2] = 200  # OpenCV's red
@@ -217,6 +229,8 @@ def test_depth_needs_its_unit_and_names_one_star(tmp_path: Path) -> None:
     for names in ("rgb.png", "*/*.png"):
         with pytest.raises(ValidationError, match="expected one"):
             ImagesSource(path=tmp_path, color=names)
+    with pytest.raises(ValidationError, match="expected names as seen from the folder"):
+        ImagesSource(path=tmp_path, color=f"{tmp_path}/rgb/*.png")
 
 
 def test_millimetres_taken_for_metres_are_told_of(
