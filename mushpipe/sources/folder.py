@@ -184,6 +184,8 @@ def _natural(text: str) -> list[str | int]:
 
 
 def _is_image(path: Path) -> bool:
+    if path.name.startswith("."):  # as a shell does; a Mac puts ._7.png beside each 7.png
+        return False
     return path.suffix[1:].lower() in SUFFIXES and path.is_file()
 
 

@@ -139,6 +139,15 @@ def test_a_picture_is_turned_as_viewers_turn_it_but_not_beside_depth(tmp_path: P
     assert beside.color[0, 0, 0] > 150 > 50 > beside.color[-1, 0, 0]
 
 
+def test_hidden_files_are_no_images(tmp_path: Path) -> None:
+    """A Mac leaves `._7.png`, which is no image, beside 7.png on foreign disks."""
+    write(tmp_path / "7.png", 7)
+    (tmp_path / "._7.png").write_bytes(b"\x00\x05\x16\x07" + bytes(78))
+    stage = source(tmp_path)
+    assert [int(frame.color.mean()) for frame in stage.frames()] == [7]
+    assert stage.files() == (tmp_path / "7.png",)
+
+
 def test_a_folder_as_the_source_is_one_of_images(tmp_path: Path) -> None:
     write(tmp_path / "0.png", 1)
     document = read_document(ROOT / "graphs/pick.yaml")
