@@ -25,7 +25,7 @@ from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.recording import GARBAGE, MANIFEST, Raw
 from mushpipe.core.types import RgbdFrame
 from mushpipe.sources.playing import Player
-from mushpipe.sources.recorded import NO_DEPTH, RecordedSource
+from mushpipe.sources.recorded import NO_CAMERA, NO_DEPTH, RecordedSource
 from mushpipe.sources.topics import Topics
 
 logger = logging.getLogger("mushpipe")
@@ -127,7 +127,11 @@ class StreamSource(RecordedSource):
         player = Player(self, "the stream", topics, beside, bool(self._manifest), self._counts)
         wanted = player.wanted()
         known = (raw for raw in chain(head, messages) if raw.channel.topic in wanted)
-        yield from player.play(known, hold=False)
+        for frame in player.play(known, hold=False):
+            if frame.camera is None and player.frames == 1:
+                why = f" ({player.error})" if player.error else ""
+                logger.warning(NO_CAMERA, "the stream", why)
+            yield frame
         if self._interrupted.is_set():
             return
         if reader.damage or player.error:

@@ -113,6 +113,19 @@ def test_a_stream_of_colour_alone_does_not_wait_for_depth(
     assert "the stream has no depth" in caplog.text
 
 
+def test_a_stream_without_calibration_says_so_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    writer = RecordingWriter(tmp_path / "s.mcap", {MANIFEST: {"json": "{}"}})
+    for i in range(3):
+        writer.frame(RgbdFrame(Header(i, i, "c"), *picture(i), 0.000125))
+    writer.close()
+    assert [frame.camera for frame in opened(tmp_path / "s.mcap").frames()] == [None] * 3
+    assert caplog.messages == [
+        "the stream has no calibration: nothing can be measured in metres",
+    ]
+
+
 def test_frames_come_as_they_were_sent(tmp_path: Path) -> None:
     frames = list(opened(stream(tmp_path / "s.mcap", 30)).frames())
     assert [frame.header.sequence for frame in frames] == list(range(7, 37))
