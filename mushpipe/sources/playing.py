@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Set
 from dataclasses import replace
 from types import EllipsisType
 from typing import Any, TypeVar
 
+from mcap.records import Schema
 from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoders
 from mcap_ros2.decoder import DecoderFactory as Ros2Decoders
 
@@ -26,6 +28,8 @@ from mushpipe.sources.topics import Topics, is_beside, says_aligned
 T = TypeVar("T")
 logger = logging.getLogger("mushpipe")
 MOST_BESIDE = 256  # frames of which something waits that was recorded beside them
+_CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+_ROS1_NAME = re.compile(rb"^(float64\[\d*\] +)([DKRP])\b", re.MULTILINE)
 
 
 class Player:
@@ -167,8 +171,9 @@ class Player:
     ) -> T | None:
         """Decode a message, or return None and count it where ``what`` says as what."""
         try:
+            schema = _with_ros2_names(raw.schema)
             for factory in self._factories:
-                decoder = factory.decoder_for(raw.channel.message_encoding, raw.schema)
+                decoder = factory.decoder_for(raw.channel.message_encoding, schema)
                 if decoder is not None:
                     return decode(decoder(raw.message.data), raw)
             raise ValueError(f"message encoding '{raw.channel.message_encoding}' is not supported")
@@ -244,6 +249,14 @@ class Player:
 _Calibration = Camera | None | EllipsisType  # which is that nothing was stated yet
 _Color = tuple[Header, Any, _Calibration]
 _Depth = tuple[str, Any, float]
+
+
+def _with_ros2_names(schema: Schema | None) -> Schema | None:
+    """Return a schema that can be read: a bag converted from ROS 1 keeps its D, K, R and P."""
+    if schema is None or schema.name != _CAMERA_INFO or schema.encoding != "ros2msg":
+        return schema
+    names = _ROS1_NAME.sub(lambda found: found[1] + found[2].lower(), schema.data)
+    return replace(schema, data=names)
 
 
 def _stamp(message: Any, raw: Raw) -> tuple[int, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ import foxglove
 import numpy as np
 from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 from foxglove.messages import CameraCalibration, RawImage, Timestamp
+from rosbags.convert import convert
+from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -32,6 +35,7 @@ RECT = CAMERA + "depth/image_rect_raw"
 FX, FY, CX, CY = 617.5, 618.25, 3.5, 2.25
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
+ROS1 = get_typestore(Stores.ROS1_NOETIC)
 Entry = tuple[str, int, Any]
 
 
@@ -156,6 +160,37 @@ def write_bag(folder: Path, entries: Iterable[Entry], name: str = "bag") -> Path
                 connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
             writer.write(connections[topic], log_time, STORE.serialize_cdr(message, kind))
     return folder / name / f"{name}.mcap"
+
+
+def write_ros1_bag(path: Path, entries: Iterable[Entry]) -> Path:
+    """Write (topic, log time, message of ROS 2) as a bag of ROS 1."""
+    connections: dict[str, Any] = {}
+    with Ros1Writer(path) as writer:
+        for topic, log_time, message in entries:
+            kind = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=ROS1)
+            content = ROS1.serialize_ros1(_of_ros1(message), kind)
+            writer.write(connections[topic], log_time, content)
+    return path
+
+
+def _of_ros1(message: Any) -> Any:
+    """Return a message of ROS 2 as ROS 1 has it: headers are numbered, matrices have capitals."""
+    if not hasattr(message, "__msgtype__") or message.__msgtype__.startswith("builtin"):
+        return message
+    of_camera = message.__msgtype__.endswith("CameraInfo")
+    values = {f.name: _of_ros1(getattr(message, f.name)) for f in fields(message)}
+    values.pop("__msgtype__", None)
+    values |= {"seq": 0} if message.__msgtype__.endswith("Header") else {}
+    named = {k.upper() if of_camera and len(k) == 1 else k: v for k, v in values.items()}
+    return ROS1.types[message.__msgtype__](**named)
+
+
+def converted(bag: Path, folder: Path) -> Path:
+    """Make a ROS 2 bag of one of ROS 1 by `rosbags-convert`, and return its MCAP file."""
+    convert([bag], folder, "mcap", 9, None, "none", None, None, (), (), (), ())
+    return folder / f"{folder.name}.mcap"
 
 
 def write_foxglove(

@@ -25,12 +25,14 @@ from tests.io.bags import (
     camera_info,
     color_at,
     color_pixels,
+    converted,
     depth_at,
     drain,
     play,
     raw_image,
     write_bag,
     write_foxglove,
+    write_ros1_bag,
 )
 
 CALIBRATED = Camera(WIDTH, HEIGHT, FX, FY, CX, CY)
@@ -268,6 +270,14 @@ def test_a_lens_that_is_left_out_for_the_name_of_its_images_is_told_of(
     found = play(write_bag(tmp_path, [info, *colors]))
     assert [frame.camera.model for frame in found if frame.camera] == ["none"] * 3
     assert caplog.text.count("the distortion that its calibration states is not applied") == 1
+
+
+def test_a_bag_that_was_converted_from_ros_1_has_its_calibration(tmp_path: Path) -> None:
+    """ROS 1 calls the matrices D, K, R and P, and `rosbags-convert` leaves these names."""
+    lens = {"d": (0.1, 0.2, 0.3, 0.4, 0.5)}
+    bag = write_ros1_bag(tmp_path / "a.bag", [info_at(0, **lens), *COLORS])
+    (camera,) = {frame.camera for frame in play(converted(bag, tmp_path / "b"))}
+    assert camera == Camera(WIDTH, HEIGHT, FX, FY, CX, CY, "brown_conrady", lens["d"])
 
 
 def test_rectified_images_of_a_calibration_without_distortion(tmp_path: Path) -> None:
