@@ -43,6 +43,16 @@ SUMMARY = "mushpipe.summary"
 GRAPH = "mushpipe.graph"
 
 
+CONVERT = "'rosbags-convert --src {} --dst NEW_FOLDER --dst-storage mcap'"
+# What other recordings begin with: what they are, and what makes them readable.
+_OTHERS = {
+    b"SQLite f": f"a ROS 2 bag in SQLite: {CONVERT.format('ITS_FOLDER')} makes MCAP of it",
+    b"#ROSBAG ": f"a bag of ROS 1: {CONVERT.format('FILE')} makes MCAP of it; one of Intel's "
+    "viewer is played where its name ends with .bag",
+    b"\x28\xb5\x2f\xfd": "compressed as a whole: 'zstd -d FILE' unpacks it",
+}
+
+
 class Raw(NamedTuple):
     """A message as it stands in the file."""
 
@@ -100,7 +110,9 @@ class RecordingReader:
         if not magic:
             raise InputError(f"{path}: the file is empty")
         if magic != b"\x89MCAP0\r\n":
-            raise InputError(f"{path}: not an MCAP file (it begins with {magic!r})")
+            known = [what for begin, what in _OTHERS.items() if magic.startswith(begin)]
+            what = f"it is {known[0]}" if known else f"it begins with {magic!r}"
+            raise InputError(f"{path}: not an MCAP file ({what})")
 
     def messages(
         self,

@@ -23,6 +23,7 @@ from mushpipe.sources.recorded import NO_CAMERA, NO_DEPTH, Intrinsics
 
 logger = logging.getLogger("mushpipe")
 SUFFIXES = frozenset(["png", "jpg", "jpeg", "tif", "tiff", "bmp", "webp", "pgm", "ppm"])
+RECORDINGS = (".mcap", ".db3", ".bag", ".zstd")  # what may stand in a folder that is a ROS 2 bag
 _TO_RGB = cv2.COLOR_BGR2RGB
 ALONE = "%s images without a %s image"
 
@@ -158,6 +159,8 @@ def _required(folder: Path, setting: str, names: str) -> dict[str, Path]:
     kinds = Counter(str(path.relative_to(folder).with_stem("*")) for path in images or files)
     hint = ", ".join(f"{each} ({count})" for each, count in kinds.most_common(8)) or "nothing"
     hint = f"no image, but {hint}" if files and not images else hint
+    if bags := sorted(path for path in files if path.suffix in RECORDINGS):
+        hint += f"; a recording is played by its file: --source '{bags[0]}'"
     raise InputError(f"{folder}: no image is named {names} (source.{setting}); there is {hint}")
 
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from mushpipe.core.errors import DeviceError, InputError
 from mushpipe.core.libraries import import_realsense
+from mushpipe.core.recording import CONVERT
 from mushpipe.sources.realsense_bag import count_color_images
 from mushpipe.sources.realsense_device import find_device, info
 
@@ -128,6 +129,8 @@ class FileLink:
             reason = str(error).rpartition("reader: ")[2]
             if "unindexed" in reason.lower():
                 reason = "it was never closed; 'rosbag reindex' repairs it"
+            elif "file_version" in reason:
+                reason = f"it is a bag of ROS 1: {CONVERT.format('FILE')} makes MCAP of it"
             raise InputError(f"{path}: not a readable RealSense recording: {reason}") from error
         self._playback = self.profile.get_device().as_playback()
         # Else it plays at its own pace and drops what comes too late.

@@ -61,7 +61,7 @@ def test_metadata_and_attachments_are_listed(tmp_path):
     ("content", "message"),
     [
         (b"", "the file is empty"),
-        (b"#ROSBAG V2.0\n", "not an MCAP file (it begins with b'#ROSBAG ')"),
+        (b"MThd\0\0\0\6\0", "not an MCAP file (it begins with b'MThd\\x00\\x00\\x00\\x06')"),
         (MAGIC[:4], "not an MCAP file (it begins with b'\\x89MCA')"),
     ],
 )

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as BagWriter
 
 from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.types import RgbdFrame
+from mushpipe.sources.folder import ImagesSource
 from mushpipe.sources.mcap import McapSource
+from mushpipe.sources.realsense import RealsenseSource
 from tests.io.bags import (
     COLOR,
     PERIOD,
+    STORE,
     T0,
     color_at,
     color_pixels,
@@ -29,6 +35,7 @@ from tests.io.bags import (
     ros,
     write_bag,
     write_foxglove,
+    write_ros1_bag,
 )
 
 FRAMES = 4
@@ -169,7 +176,7 @@ def test_a_record_whose_type_is_damaged_is_missed(whole: Path, tmp_path: Path) -
     ("content", "message"),
     [
         (b"", "the file is empty"),
-        (b"#ROSBAG V2.0\n", "not an MCAP file (it begins with b'#ROSBAG ')"),
+        (b"MThd\0\0\0\6\0", "not an MCAP file (it begins with b'MThd\\x00\\x00\\x00\\x06')"),
         (b"\x89MC", "not an MCAP file"),
     ],
 )
@@ -182,6 +189,50 @@ def test_a_file_that_is_no_recording_is_refused(
         play(path)
     assert str(error.value).startswith(f"{path}: {message}")
     assert error.value.exit_code == 4
+
+
+def bags(folder: Path, **how: Any) -> Path:
+    """Write a ROS 2 bag with rosbags, compressed or in SQLite, and return its file."""
+    writer = BagWriter(
+        folder / "bag", version=9, storage_plugin=how.get("storage", StoragePlugin.MCAP)
+    )
+    if "mode" in how:
+        writer.set_compression(how["mode"], CompressionFormat.ZSTD)
+    with writer:
+        for topic, time, message in rgbd([0]):
+            at = writer.add_connection(topic, message.__msgtype__, typestore=STORE)
+            writer.write(at, time, STORE.serialize_cdr(message, message.__msgtype__))
+    return next(path for path in (folder / "bag").iterdir() if path.suffix != ".yaml")
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        (
+            {"storage": StoragePlugin.SQLITE3},
+            "a ROS 2 bag in SQLite: 'rosbags-convert --src ITS_F",
+        ),
+        (
+            {"mode": CompressionMode.FILE},
+            "(it is compressed as a whole: 'zstd -d FILE' unpac",
+        ),
+        ({"mode": CompressionMode.MESSAGE}, "each message is compressed (ros2 bag record --compr"),
+    ],
+)
+def test_a_bag_that_must_be_converted_says_how(how: Any, message: str, tmp_path: Path) -> None:
+    path = bags(tmp_path, **how)
+    frames, error = drain(McapSource(path=path))
+    assert not frames
+    assert message in str(error)
+    with pytest.raises(InputError, match=f"is played by its file: --source '{path}'$"):
+        ImagesSource(path=path.parent).open()
+
+
+def test_a_bag_of_ros_1_says_how_to_convert_it(tmp_path: Path) -> None:
+    path = write_ros1_bag(tmp_path / "a.bag", rgbd([0]))
+    for play_it in (play, lambda path: RealsenseSource(file=path).open()):
+        with pytest.raises(InputError, match="a bag of ROS 1: 'rosbags-convert --src FILE"):
+            play_it(path)
 
 
 def test_a_file_of_nothing_but_magic_is_refused(tmp_path: Path) -> None:
