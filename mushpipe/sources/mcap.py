@@ -19,7 +19,7 @@ from mushpipe.core.stage import ReplaySource
 from mushpipe.core.types import RgbdFrame
 from mushpipe.sources.playing import Player
 from mushpipe.sources.recorded import NO_CAMERA, NO_DEPTH, RecordedSource
-from mushpipe.sources.topics import Topics, choose_topics
+from mushpipe.sources.topics import Topics, choose_topics, untold_images
 
 logger = logging.getLogger("mushpipe")
 
@@ -89,6 +89,11 @@ class McapSource(RecordedSource, ReplaySource):
         beside = _beside(index) if numbered else set()
         if topics.depth is None:
             logger.warning(NO_DEPTH, self.path.name)
+            if self.use_depth and (others := untold_images(index, topics.color)):
+                logger.warning(
+                    "where one of these is depth, aligned to colour, name it: %s",
+                    " or ".join(f"--set source.depth_topic={topic}" for topic in others),
+                )
         player = Player(self, str(self.path), topics, beside, numbered, self._counts)
         yield from self._passes(player, reader, index)
 

@@ -115,6 +115,12 @@ def _depths(images: list[str]) -> list[str]:
     return _without_transports(aligned or depths)
 
 
+def untold_images(index: Index, color: str) -> list[str]:
+    """Return the topics of other images whose names do not say of what: depth may be one."""
+    images = _topics(index, IMAGES)
+    return _without_transports([t for t in images if not _kind(t) and _base(t) != _base(color)])
+
+
 def _without_transports(topics: list[str]) -> list[str]:
     """Drop the compressed twin of a topic that is there raw."""
     return [t for t in topics if _base(t) == t or _base(t) not in topics]

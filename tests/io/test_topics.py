@@ -242,6 +242,22 @@ def test_unaligned_depth_may_be_left_out(tmp_path: Path, caplog: pytest.LogCaptu
     ]
 
 
+def test_depth_whose_topic_does_not_say_so_is_asked_for(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As depthai_ros_driver calls the depth of an OAK-D."""
+    colors = [color_at(i, topic="/oak/rgb/image_raw") for i in range(3)]
+    depths = [depth_at(i, topic="/oak/stereo/image_raw") for i in range(3)]
+    path = write_bag(tmp_path, [*colors, *depths])
+    assert [frame.depth for frame in play(path)] == [None] * 3
+    setting = "--set source.depth_topic=/oak/stereo/image_raw"
+    assert f"is depth, aligned to colour, name it: {setting}" in caplog.messages[1]
+    caplog.clear()
+    play(path, use_depth=False)
+    assert "name it" not in caplog.text
+    assert all(frame.depth is not None for frame in play(path, depth_topic="/oak/stereo/image_raw"))
+
+
 def test_rectified_depth_in_the_frame_of_the_colour_is_taken(tmp_path: Path) -> None:
     # A D405 has one optical frame for both.
     frame = first(tmp_path, [color_at(0), depth_at(0, topic=RECT)])
