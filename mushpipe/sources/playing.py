@@ -33,6 +33,7 @@ _COMPRESSED = (
     "each message is compressed (ros2 bag record --compression-mode message): "
     f"{CONVERT.format('ITS_FOLDER')} unpacks them"
 )
+_RECTIFIED = ("rect", "rectified")  # image_rect_color, as ROS has it; others say image_color_rect
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _ROS1_NAME = re.compile(rb"^(float64\[\d*\] +)([DKRP])\b", re.MULTILINE)
 
@@ -148,7 +149,8 @@ class Player:
         After one that cannot be decoded none is known; it is counted where ``what`` says as what.
         """
         name = self.topics.color.split("/")
-        rectified = any(part.startswith("image_rect") for part in name)  # as ROS calls them
+        words = {word for part in name for word in part.split("_")}
+        rectified = not words.isdisjoint(_RECTIFIED)
 
         def decode(message: Any, raw: Raw) -> Camera | None:
             self._calibrated = _stamp(message, raw)[1]

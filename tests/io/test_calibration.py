@@ -25,9 +25,11 @@ from tests.io.bags import (
     camera_info,
     color_at,
     color_pixels,
+    compressed,
     converted,
     depth_at,
     drain,
+    encoded,
     play,
     raw_image,
     write_bag,
@@ -213,11 +215,27 @@ def test_a_new_calibration_does_not_reach_back_to_an_image_that_waits_for_its_de
     assert found == [FX, FX, 500.0, 500.0]
 
 
-def test_rectified_images_have_the_projection_matrix_and_no_distortion(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "name",
+    [
+        "image_rect",
+        "image_rect_color/compressed",
+        "image_color_rect",
+        "image_rectified",
+        "rect/image",
+    ],
+)
+def test_rectified_images_have_the_projection_matrix_and_no_distortion(
+    name: str, tmp_path: Path
+) -> None:
+    """Names of image_proc, of kinect2_bridge, of others, of the ZED wrapper."""
     p = (500.0, 0, 3, 0, 0, 510.0, 2, 0, 0, 0, 1, 0)
     info = camera_info(d=(0.1, 0, 0, 0, 0), p=p)
-    topic = "/camera/color/image_rect_color"
-    entries = [("/camera/color/camera_info", T0, info), color_at(0, topic=topic)]
+    topic = f"/camera/color/{name}"
+    message = color_at(0)[2]
+    if "compressed" in name:
+        message = compressed(encoded(color_pixels(0), ".png"), "rgb8; png compressed bgr8")
+    entries = [(f"{topic.partition('/image')[0]}/camera_info", T0, info), (topic, T0, message)]
     assert cameras(tmp_path, entries) == [Camera(WIDTH, HEIGHT, 500.0, 510.0, 3.0, 2.0)]
 
 
