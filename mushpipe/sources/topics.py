@@ -59,7 +59,7 @@ def choose_topics(
     color = color or _one(path, "color", _colors(images))
     if color is None:
         found = ", ".join(sorted(index.channels)) or "no topics at all"
-        raise InputError(f"{path}: it holds no colour images (it holds {found})")
+        raise InputError(f"{path}: it holds no colour images (it holds {found}){_of_others(index)}")
     if not use_depth:
         depth = None
     elif depth is None:
@@ -71,6 +71,13 @@ def choose_topics(
                 "without it: --set source.use_depth=false"
             )
     return Topics(color, depth, camera or _calibration(index, path, color))
+
+
+def _of_others(index: Index) -> str:
+    """Say which topics are called colour and hold what is not read: video, or images of ROS 1."""
+    kinds = {t: index.schema_name(t) for t in sorted(index.channels) if _kind(t) == "color"}
+    odd = [f"{t} holds {kind}" for t, kind in kinds.items() if kind not in IMAGES | CALIBRATIONS]
+    return f"; {', '.join(odd)}, expected {' or '.join(sorted(IMAGES))}" if odd else ""
 
 
 def _check_named(index: Index, path: Path, topic: str, kinds: set[str]) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.writer import Writer as McapWriter
 
 from mushpipe.core.errors import InputError
 from mushpipe.core.types import RgbdFrame
@@ -240,6 +241,20 @@ def test_unaligned_depth_may_be_left_out(tmp_path: Path, caplog: pytest.LogCaptu
     assert caplog.messages == [
         "bag.mcap has no depth: positions, distances and diameters will be missing"
     ]
+
+
+@pytest.mark.parametrize("kind", ["sensor_msgs/Image", "foxglove.CompressedVideo"])
+def test_colour_of_a_kind_that_is_not_read_is_told_of(kind: str, tmp_path: Path) -> None:
+    """Of a bag of ROS 1 that `mcap convert` made MCAP of, and of video."""
+    path = tmp_path / "a.mcap"
+    writer = McapWriter(str(path))
+    writer.start()
+    schema = writer.register_schema(kind, "ros1msg", b"")
+    channel = writer.register_channel("/camera/color/image_raw", "ros1", schema)
+    writer.add_message(channel, 1, b"", 1)
+    writer.finish()
+    with pytest.raises(InputError, match=rf"color/image_raw holds {kind}, expected foxglove\.C"):
+        play(path)
 
 
 def test_depth_whose_topic_does_not_say_so_is_asked_for(
