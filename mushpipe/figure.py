@@ -25,6 +25,7 @@ T = TypeVar("T")
 GREEN, RED, BLUE, YELLOW = "#28c840", "#e02020", "#1440e0", "#ffd000"
 PANEL_IN = 4.6  # width of an image
 DPI = 150
+FONT = 6  # points
 
 
 class Panel(NamedTuple):
@@ -246,20 +247,24 @@ def _rings(axes: Axes, circles: Circles, cross: bool = False) -> None:
 
 def _pairs(axes: Axes, circles: Circles, depth: Floats, distance: Floats) -> None:
     _rings(axes, circles)
-    for (x, y), r, z, d in zip(circles.center, circles.radius, depth, distance, strict=True):
-        _text(axes, x, y - 0.32 * min(r, 18), _metres(z), BLUE)
-        _text(axes, x, y + 0.32 * min(r, 18), _metres(d), RED)
+    for (x, y), z, d in zip(circles.center, depth, distance, strict=True):
+        _text(axes, x, y, _metres(z), BLUE, 0.6 * FONT)
+        _text(axes, x, y, _metres(d), RED, -0.6 * FONT)
 
 
 def _metres(value: float) -> str:
     return f"{value:.3f}" if np.isfinite(value) else "NaN"
 
 
-def _text(axes: Axes, x: float, y: float, text: str, color: str) -> None:
+def _text(axes: Axes, x: float, y: float, text: str, color: str, above: float = 0.0) -> None:
+    """Write at a pixel, or so many points above it: the font knows no pixels of the image."""
     from matplotlib.patheffects import withStroke
 
     outline = [withStroke(linewidth=1.6, foreground="white")]
     # the centre of a circle over the border may lie beyond it
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()[::-1]
     x, y = min(max(x, left), right), min(max(y, low), high)
-    axes.text(x, y, text, color=color, fontsize=6, ha="center", va="center", path_effects=outline)
+    axes.annotate(
+        text, (x, y), (0, above), textcoords="offset points", color=color, fontsize=FONT,
+        ha="center", va="center", path_effects=outline,
+    )  # fmt: skip

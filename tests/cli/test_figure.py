@@ -15,9 +15,10 @@ from mushpipe.cli import app
 from mushpipe.core.errors import DependencyError, UsageError
 from mushpipe.core.libraries import import_open3d
 from mushpipe.figure import BLUE, RED, draw_diameter, draw_localization, draw_pose, draw_stages
+from mushpipe.stages.nearest_depth import NearestDepth
 from tests.io.values import make_frame, record, trace_of
 
-NAN = float("nan")
+NAN, ONES = float("nan"), np.ones(3)
 
 try:
     import_open3d()
@@ -104,7 +105,28 @@ def test_every_panel_is_drawn() -> None:
 def test_diameters_stand_at_the_centres_and_unknown_ones_say_so() -> None:
     (axes,) = draw_diameter(scene()).axes
     assert texts(axes, RED) == ["41", "NaN"]
-    assert [t.get_position() for t in axes.texts] == [(10, 5), (20, 12)]
+    assert [t.xy for t in axes.texts] == [(10, 5), (20, 12)]
+
+
+@pytest.mark.parametrize(("width", "height"), [(640, 480), (1920, 1080)])
+def test_depth_and_distance_can_both_be_read(width: int, height: int) -> None:
+    camera = Camera(width, height, 900.0, 900.0, width / 2, height / 2)
+    depth = np.full((height, width), 500, np.uint16)
+    frame = make_frame(
+        color=np.zeros((height, width, 3), np.uint8), depth=depth, depth_scale=1e-3, camera=camera
+    )
+    # the last one's centre lies over the border
+    circles = Circles(np.array([[300.0, 200], [90, 90], [500, -3]]), np.array([60.0, 8, 30]), ONES)
+    locations = NearestDepth().process(frame, circles)
+    figure = draw_localization(trace_of(frame, detect=circles, locate=locations))
+    figure.canvas.draw()
+    for axes in figure.axes:
+        depths, distances = (
+            [t.get_window_extent() for t in axes.texts if t.get_color() == color]
+            for color in (BLUE, RED)
+        )
+        for upper, lower in zip(depths, distances, strict=True):
+            assert upper.y0 >= lower.y1 - 1
 
 
 def dome() -> Trace:
