@@ -94,9 +94,17 @@ class Results:
 
     @property
     def partial(self) -> bool:
-        """Whether the run was asked to play only a part of its source."""
+        """Whether these are the results of a part of the source: asked for, or in this file."""
         source = self.manifest.get("graph", {}).get("source", {})
-        return any(source.get(key) for key in ("max_frames", "max_seconds", "start", "end"))
+        asked = any(source.get(key) for key in ("max_frames", "max_seconds", "start", "end"))
+        return asked or self.split
+
+    @property
+    def split(self) -> bool:
+        """Whether this is one of several files that a sink with `split_size` wrote."""
+        sinks = self.manifest.get("graph", {}).get("sinks", {}).values()
+        processed = self.summary.get("frames", {}).get("processed")
+        return any(sink.get("split_size") for sink in sinks) and processed != len(self.frames)
 
     @property
     def played(self) -> dict[str, str]:
@@ -112,10 +120,12 @@ class Results:
     def span(self, name: str) -> range:
         """Return from which to which ``stamp_ns`` or ``sequence`` the run looked at frames.
 
-        Where the file does not say how the run went, those it answered stand for them.
+        Where the file does not say how the run went, those it answered stand for them; so they do
+        in one of several files, of which the last alone says where the run ended.
         """
         answered = [getattr(header, name) for header, _ in self.frames]
-        seen = self.summary.get("span", {}).get(name, answered)
+        stated = self.summary.get("span", {}).get(name, [])
+        seen = [*answered, *stated[1:]] if self.split else stated or answered
         return range(min(seen), max(seen) + 1) if seen else range(0)
 
     @property

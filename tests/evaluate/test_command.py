@@ -315,6 +315,43 @@ def test_parts_of_one_recording_are_judged_together(tmp_path: Path, truths: dict
     assert only["overall"]["frames"] == 3
 
 
+def test_files_of_a_split_run_are_judged_each_on_its_frames(
+    graph: Path, tmp_path: Path, truths: dict[int, Any]
+) -> None:
+    write_recording(tmp_path / "bed.mcap", {**truths, 3: bed(3)})
+    text = graph.read_text()
+    graph.write_text(text.replace("must-not-be-written.mcap", "s.mcap, split_size: 20KB"))
+    assert CliRunner().invoke(app, ["run", str(graph)]).exit_code == 0
+    (tmp_path / "whole.yaml").write_text(text.replace("must-not-be-written.mcap", "w.mcap"))
+    assert CliRunner().invoke(app, ["run", str(tmp_path / "whole.yaml")]).exit_code == 0
+    whole = judged(tmp_path / "w.mcap")["alternatives"][0]
+    parts = sorted(tmp_path.glob("s_*.mcap"))
+    assert len(parts) > 1
+    (together,) = judged(*parts)["alternatives"]
+    counts = ("frames", "found", "missed", "false", "ignored")
+    assert [together["overall"][c] for c in counts] == [whole["overall"][c] for c in counts]
+    alone = [judged(part)["alternatives"][0] for part in parts]
+    frames = [frame for each in alone for frame in each["frames"]]
+    assert [[f[c] for c in counts[1:]] for f in frames] == [
+        [f[c] for c in counts[1:]] for f in whole["frames"]
+    ]
+
+
+def test_the_last_file_of_a_split_run_knows_of_frames_that_failed_at_the_end(
+    tmp_path: Path, truths: dict[int, Any]
+) -> None:
+    manifest = json.loads(manifest_of(write_recording(tmp_path / "bed.mcap", truths), "bed.mcap"))
+    manifest["graph"]["sinks"] = {"log": {"use": "mcap", "split_size": 1000}}
+    ends = {"stamp_ns": [header(0).stamp_ns, header(2).stamp_ns], "sequence": [0, 2]}
+    summary = {"span": ends, "frames": {"processed": 2, "failed": 1}}
+    answers = {1: picks_of(truths[1])}
+    last = write_results(
+        tmp_path / "s_001.mcap", answers, None, json.dumps(manifest), None, summary
+    )
+    (only,) = judged(last, "--truth", tmp_path / "bed.mcap")["alternatives"]
+    assert [frame["answered"] for frame in only["frames"]] == [True, False]
+
+
 def test_damage_is_judged_as_far_as_it_goes(perfect: Path) -> None:
     perfect.write_bytes(perfect.read_bytes()[:-200])
     result = run(perfect)
