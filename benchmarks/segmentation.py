@@ -133,7 +133,14 @@ def measured(
 def solve(stage: ChanVese | None, image: Plane) -> Region:
     """Run a solver from Otsu's start."""
     initial = otsu_foreground(image)
+    if stage is not None and stage.solver == "pde":
+        stage = stage.model_copy(update={"mu": mu_stretched(image, MU)})
     return initial if stage is None else stage.solve(image, initial)
+
+
+def mu_stretched(image: Plane, mu: float) -> float:
+    """Return the weight with which scikit-image, which stretches images to 0..1, minimises E."""
+    return mu / float(np.ptp(image)) ** 2
 
 
 def timed(call: Callable[[], T], repeats: int) -> tuple[T, float]:

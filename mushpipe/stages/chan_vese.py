@@ -35,7 +35,11 @@ class ChanVese(Stage):
     check: bool = Field(
         True, description="empty mask where there are no two classes; false is plain Otsu"
     )
-    mu: float = Field(0.1, gt=0, description="weight of the contour's length, on gray in 0..1")
+    mu: float = Field(
+        0.1,
+        gt=0,
+        description="weight of the contour's length, on gray in 0..1; `pde` stretches gray to it",
+    )
     iterations: int = Field(100, ge=1, description="most iterations of `pde` and `morphological`")
     smoothing: int = Field(1, ge=0, description="`morphological`: curvature steps per iteration")
     tolerance: float = Field(1e-3, gt=0, description="`pde`: stop when the level set moves less")

@@ -76,10 +76,11 @@ def test_fast_reaches_the_minimum_on_real_frames() -> None:
 
 def pde_is_not_lower(images: list[np.ndarray]) -> None:
     """Fast against scikit-image's level set after 500 iterations from the same start."""
-    pde = ChanVese(solver="pde", iterations=500, tolerance=1e-9)
     energies = []
     for image in images:
         initial = otsu_foreground(image)
+        mu = MU / float(np.ptp(image)) ** 2  # scikit-image stretches the image to 0..1
+        pde = ChanVese(solver="pde", iterations=500, tolerance=1e-9, mu=mu)
         found = [solve_fast(image, initial, MU), pde.solve(image, initial)]
         energies.append([chan_vese_energy(image, region, MU) for region in found])
     ours, reference = np.array(energies).T
@@ -92,6 +93,16 @@ def test_fast_is_not_above_the_level_set_on_simulated_beds() -> None:
 
 def test_fast_is_not_above_the_level_set_on_real_frames() -> None:
     pde_is_not_lower([image[180:300, 240:400] for image in real_images()])
+
+
+def test_the_weight_of_the_level_set_is_on_the_stretched_image() -> None:
+    bright = np.rint(drawn(9, 0.1) * 255)
+    dim = np.rint(bright / 2) * 2  # the same levels in both
+    solved = [
+        ChanVese(solver="pde", iterations=30).solve(image, otsu_foreground(dim / 255))
+        for image in ((dim / 255).astype(np.float32), (dim / 510 + 0.2).astype(np.float32))
+    ]
+    np.testing.assert_array_equal(*solved)
 
 
 def test_chan_vese_lowers_the_energy_of_its_start() -> None:
