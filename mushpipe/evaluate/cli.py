@@ -181,7 +181,7 @@ def _planes(
     else:
         from mushpipe.evaluate.show import plane_table, threshold_table
 
-        checked = [threshold_table([("", item) for item in outcomes])] if outcomes else []
+        checked = [threshold_table(outcomes)] if outcomes else []
         _print([plane_table(rows), *checked])
     return code
 

@@ -32,10 +32,12 @@ def judgement_json(judgement: Judgement) -> str:
     )
 
 
-def planes_json(rows: Iterable[PlaneRow], outcomes: Iterable[Outcome], exit_code: int) -> str:
+def planes_json(
+    rows: Iterable[PlaneRow], outcomes: Iterable[tuple[str, Outcome]], exit_code: int
+) -> str:
     """Return the depth accuracy on planes as JSON."""
     planes = [asdict(row) for row in rows]
-    thresholds = [_outcome("", item) for item in outcomes]
+    thresholds = [_outcome(name, item) for name, item in outcomes]
     return _dump({"planes": planes, "thresholds": thresholds, "exit_code": exit_code})
 
 

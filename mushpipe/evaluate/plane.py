@@ -110,7 +110,7 @@ def measure_plane(
 
 def judge_planes(
     recordings: list[Path], distances: str, thresholds: list[str], resamples: int, seed: int
-) -> tuple[list[PlaneRow], list[Outcome], int]:
+) -> tuple[list[PlaneRow], list[tuple[str, Outcome]], int]:
     """Measure recordings of planes.
 
     Args:
@@ -121,7 +121,7 @@ def judge_planes(
         seed: Seed of the bootstrap.
 
     Returns:
-        A row per recording, the thresholds' outcomes, and the exit code.
+        A row per recording, the thresholds' outcomes with the recording's name, and the exit code.
 
     Raises:
         UsageError: The distances or thresholds are wrong.
@@ -135,11 +135,11 @@ def judge_planes(
         for path, truth in zip(recordings, truths, strict=True)
     ]
     outcomes = [
-        outcome
+        (row.name, outcome)
         for row in rows
         for outcome in check(bounds, {name: value.value for name, value in row.values.items()})
     ]
-    return rows, outcomes, EXIT_OK if all(o.kept for o in outcomes) else EXIT_DIFFERS
+    return rows, outcomes, EXIT_OK if all(o.kept for _, o in outcomes) else EXIT_DIFFERS
 
 
 def _distances(text: str, recordings: int) -> list[float]:

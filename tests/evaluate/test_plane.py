@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -82,7 +83,11 @@ def test_one_distance_for_all_or_one_each(tmp_path: Path) -> None:
     assert [round(row.values["offset_mm"].value) for row in rows] == [3, 3]
     assert (len(outcomes), code) == (2, 0)
     _, outcomes, code = judge_planes(files, "0.51", ["offset_mm<=5"], 50, 0)
-    assert ([o.kept for o in outcomes], code) == ([True, False], 3)
+    assert code == 3
+    assert [(name, o.kept) for name, o in outcomes] == [
+        (files[0].stem, True),
+        (files[1].stem, False),
+    ]
     with pytest.raises(UsageError, match="one distance"):
         judge_planes(files, "0.51,0.6,0.7", [], 0, 0)
     with pytest.raises(UsageError, match="expected metres"):
@@ -106,6 +111,17 @@ def test_command(tmp_path: Path) -> None:
     assert result.exit_code == 0
     assert "offset mm" in result.stdout
     assert "2.8" in result.stdout
+
+
+def test_a_missed_threshold_names_its_recording(tmp_path: Path) -> None:
+    files = [plane(tmp_path, 0.51, 0.003, 0.001), plane(tmp_path, 0.59, 0.003, 0.002)]
+    command = ["eval", "--plane", "0.51,0.59", "--threshold", "std_mm<=1.5", *map(str, files)]
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 3
+    (missed,) = (line for line in result.stdout.splitlines() if line.endswith("missed"))
+    assert missed.startswith(f"std_mm<=1.5 {files[1].stem} ")
+    data = json.loads(CliRunner().invoke(app, [*command, "--format", "json"]).stdout)
+    assert [t["label"] for t in data["thresholds"]] == [file.stem for file in files]
 
 
 def test_a_calibration_takes_off_what_was_put_in(tmp_path: Path) -> None:
