@@ -144,7 +144,10 @@ def _by_radius(events: Events) -> tuple[Figure | None, str, str, bool]:
 
 def _against_tilt(events: Events) -> tuple[Figure | None, str, str, bool]:
     title = "Axis error against true tilt"
-    caption = "Each mushroom, and the median per bin; on the dashed line lies the answer “upright”."
+    caption = (
+        "Each mushroom, and the median per bin; on the dashed line lies the answer “upright”. "
+        "What lies beyond the top stands on it."
+    )
     error = quantities_of(events)["axis"]
     tilt = angle_deg(events.up, events.true_axis)
     known = np.isfinite(error) & np.isfinite(tilt)
@@ -152,7 +155,9 @@ def _against_tilt(events: Events) -> tuple[Figure | None, str, str, bool]:
         return None, title, caption, False
     error, tilt = error[known], tilt[known]
     figure, (axes,) = _axes()
-    axes.plot(tilt, error, "o", ms=2.6, mew=0, alpha=0.45, color=BLUE)
+    top = max(float(np.quantile(error, 0.99)) * 1.15, 1.0)
+    shown = np.minimum(error, top)
+    axes.plot(tilt, shown, "o", ms=2.6, mew=0, alpha=0.45, color=BLUE, clip_on=False)
     edges = bins_of(tilt)
     if len(edges) > 1:
         bins = np.clip(np.digitize(tilt, edges) - 1, 0, len(edges) - 2)
@@ -161,7 +166,7 @@ def _against_tilt(events: Events) -> tuple[Figure | None, str, str, bool]:
     end = float(tilt.max())
     axes.plot([0, end], [0, end], "--", lw=0.9, color=INK, alpha=0.5, label="upright")
     axes.set(xlabel="true tilt, degrees", ylabel="axis error, degrees", xlim=(0, None))
-    axes.set_ylim(0, max(np.quantile(error, 0.99) * 1.15, 1.0))
+    axes.set_ylim(0, top)
     axes.legend(loc="upper right", ncols=2)
     return figure, title, caption, False
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from mushpipe.evaluate.events import events_of, judge
-from mushpipe.evaluate.plots import _stated
+from mushpipe.evaluate.plots import _against_tilt, _stated
 from mushpipe.evaluate.results import of_picks
 from mushpipe.evaluate.truth import FrameTruth
 from tests.evaluate.scenes import (
@@ -130,3 +130,22 @@ def test_the_plot_of_sigmas_shows_the_error_itself() -> None:
     np.testing.assert_allclose(square, 1, rtol=1e-6)
     np.testing.assert_allclose(root, np.sqrt((0.04 + 0.04 + 1) / 3))
     np.testing.assert_allclose(z2, (25 + 25 + 1) / 3, rtol=1e-6)
+
+
+def test_an_axis_that_is_flipped_is_in_the_plot_of_axis_errors() -> None:
+    verdicts = []
+    for number in range(20):
+        truth = bed(number)
+        axis = truth.axis.copy()
+        if number == 0:
+            axis[0] = -axis[0]  # one of 400
+        found = of_picks(picks_of(truth, axis=axis))
+        at = header(number)
+        known = FrameTruth(truth, frame_id=FRAME)
+        verdicts.append(judge("bed", ("stamp_ns", at.stamp_ns), known, at, found))
+    figure, *_ = _against_tilt(events_of(verdicts))
+    assert figure is not None
+    (axes,) = figure.axes
+    error = np.asarray(axes.lines[0].get_ydata())
+    assert len(error) == 400
+    assert error.max() == axes.get_ylim()[1] > 0.5
