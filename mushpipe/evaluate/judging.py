@@ -140,7 +140,12 @@ def judge_results(
         judged.notes.append(f"{results.failed} frames failed when the graph ran")
     if error := results.summary.get("error"):
         judged.notes.append(f"the run ended early: {error}")
-    unanswered = _unanswered(judged)
+    unanswered, elsewhere = _unanswered(judged)
+    if elsewhere:
+        judged.notes.append(
+            f"{elsewhere} frames of {truth.name} lie before or after what was played and are not "
+            "judged"
+        )
     if unanswered:
         judged.notes.append(f"{len(unanswered)} frames have no answer: all in them is missed")
     for place in unanswered:
@@ -181,18 +186,21 @@ def foreign_truth(results: Results, truth: TruthSet) -> str:
     return f"the truth is that of {truth.name}; what was played is {', '.join(played.values())}"
 
 
-def _unanswered(judged: Judged) -> list[Place]:
-    """Return the frames with truth that were not answered and should have been."""
+def _unanswered(judged: Judged) -> tuple[list[Place], int]:
+    """Return the frames with truth that were not answered and should have been.
+
+    Labels may be those of several recordings: frames beyond the ends of what was played are of
+    another one. Returns how many these are, too.
+    """
     answered = {verdict.place for verdict in judged.verdicts}
-    results = judged.results
-    # without any answer, these results and this truth may have nothing to do with each other
-    whole = bool(answered) and not results.partial
+    results, left = judged.results, [p for p in judged.truth.frames if p not in answered]
     spans = {"stamp_ns": results.span("stamp_ns"), "index": results.span("sequence")}
-    return [
-        (kind, value)
-        for kind, value in judged.truth.frames
-        if (kind, value) not in answered and (whole or value in spans[kind])
-    ]
+    within = [(kind, value) for kind, value in left if value in spans[kind]]
+    # without any answer, these results and this truth may have nothing to do with each other
+    if not answered or results.partial:
+        return within, 0
+    labels = judged.truth.recording is None
+    return (within, len(left) - len(within)) if labels and results.complete else (left, 0)
 
 
 def find_truth(results: Results) -> TruthSet:

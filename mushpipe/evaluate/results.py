@@ -107,6 +107,11 @@ class Results:
         return any(sink.get("split_size") for sink in sinks) and processed != len(self.frames)
 
     @property
+    def complete(self) -> bool:
+        """Whether the run is known to have looked at all frames of what it played."""
+        return not self.partial and self.summary.get("exit_code") == 0 and "span" in self.summary
+
+    @property
     def played(self) -> dict[str, str]:
         """The recordings that were played, by SHA-256; empty where the file does not say."""
         stated = self.manifest.get("recordings") or []

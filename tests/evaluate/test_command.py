@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from click.testing import Result
 from mcap.writer import Writer
@@ -313,6 +314,35 @@ def test_parts_of_one_recording_are_judged_together(tmp_path: Path, truths: dict
     ]
     (only,) = judged(*parts, "--truth", tmp_path / "bed.mcap")["alternatives"]
     assert only["overall"]["frames"] == 3
+
+
+def test_one_file_of_labels_serves_several_recordings(
+    graph: Path, tmp_path: Path, truths: dict[int, Any]
+) -> None:
+    """A day's labels: each recording is judged on its own frames, and on none of the others'."""
+    day = {**truths, 3: bed(3)}
+    recordings = [tmp_path / "morning.mcap", tmp_path / "noon.mcap"]
+    for recording, numbers in zip(recordings, ([0, 1], [2, 3]), strict=True):
+        write_recording(recording, {number: day[number] for number in numbers})
+    circles = {
+        number: np.column_stack([truth.center, truth.radius]) for number, truth in day.items()
+    }
+    frames = [
+        {
+            "stamp_ns": header(number).stamp_ns,
+            "caps": [dict(zip(("u", "v", "radius_px"), c, strict=True)) for c in rows.tolist()],
+        }
+        for number, rows in circles.items()
+    ]
+    labels = tmp_path / "day.json"
+    labels.write_text(json.dumps({"mushpipe_labels": 1, "frames": frames}))
+    content = judged(graph, "--recordings", *recordings, "--truth", labels)
+    assert content["alternatives"][0]["overall"]["frames"] == 4
+    assert (
+        metrics(content)["recall"] == metrics(judged(graph, "--recordings", *recordings))["recall"]
+    )
+    noted = "2 frames of day.json lie before or after what was played and are not judged"
+    assert [noted in r["notes"] for r in content["alternatives"][0]["recordings"]] == [True, True]
 
 
 def test_files_of_a_split_run_are_judged_each_on_its_frames(
