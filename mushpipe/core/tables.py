@@ -23,9 +23,15 @@ Floats = NDArray[np.float64]
 def locked(array: Any, dtype: Any) -> NDArray[Any]:
     """Return the array as C-contiguous dtype, read-only; itself where nothing needs converting.
 
-    What it is a view of becomes read-only too, or it could still change.
+    What it is a view of becomes read-only too, or it could still change. Memory that is not numpy's
+    (a camera's buffer, a bytearray) cannot be locked: what can be written there is copied.
     """
     result: NDArray[Any] = np.asarray(array, dtype, order="C")
+    owner = result
+    while isinstance(owner.base, np.ndarray):
+        owner = owner.base
+    if owner.base is not None and owner.flags.writeable:
+        result = result.copy()
     part: Any = result
     while isinstance(part, np.ndarray):
         part.flags.writeable = False

@@ -1,6 +1,8 @@
 """The per-mushroom types: shapes, lengths, dtypes, and values that contradict each other."""
 
+import ctypes
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,7 +10,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mushpipe import Circles, Columns, DepthSource, Locations, PickFlag, Picks, Poses, column
+from mushpipe import (
+    Circles,
+    Columns,
+    DepthSource,
+    Header,
+    Locations,
+    PickFlag,
+    Picks,
+    Poses,
+    RgbdFrame,
+    column,
+)
 from mushpipe.core.tables import locked
 from mushpipe.core.truth import Ignore, Instances, Truth
 
@@ -245,6 +258,23 @@ def test_what_a_view_is_of_is_locked_too():
     locked(buffer[1], np.float64)
     with pytest.raises(ValueError, match="read-only"):
         buffer[1, 0, 0] = 1
+
+
+@pytest.mark.parametrize(
+    "device", [bytearray(12), (ctypes.c_ubyte * 12)(), memoryview(bytearray(12))]
+)
+def test_a_buffer_that_is_filled_again_changes_nothing(device: Any):
+    """As of a driver that hands over each image in the memory of the one before."""
+    image = np.frombuffer(device, np.uint16).reshape(2, 3)
+    frame = RgbdFrame(Header(0, 0, "c"), np.zeros((2, 3, 3), np.uint8), image)
+    assert not frame.depth.flags.writeable
+    image[:] = 7
+    assert not frame.depth.any()
+
+
+def test_memory_that_nobody_can_write_is_not_copied():
+    array = np.frombuffer(bytes(12), np.uint8)
+    assert locked(array, np.uint8) is array
 
 
 def test_instances():
