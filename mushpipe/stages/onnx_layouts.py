@@ -49,7 +49,8 @@ def probability(found: NDArray[Any], kind: str, class_id: int) -> NDArray[np.flo
     shares = _shares(planes)
     if kind == "probabilities" and not shares:
         raise ValueError(f"values are {_range(planes)}")
-    if kind == "logits" and (shares or found.dtype.kind != "f"):
+    labels = found.dtype.kind != "f" or (len(planes) == 1 and planes.min() >= 0 and _whole(planes))
+    if kind == "logits" and (shares or labels):
         raise ValueError(
             f"values are {_range(planes)}, {found.dtype}, which logits are not; if a sigmoid, "
             "softmax or argmax is in the model, it is output 'probabilities' or 'labels'"
@@ -85,12 +86,18 @@ def boxes_of(found: Floats, kind: str, class_id: int) -> tuple[Floats, Floats]:
     objectness, classes = (rows[:, 4], rows[:, 5:]) if kind == "yolov5" else (1.0, rows[:, 4:])
     if not 0 <= class_id < classes.shape[1]:
         raise IndexError(f"classes: {classes.shape[1]}")
-    if kind == "yolov8" and rows.shape[1] > len(rows) > 5:
+    if kind == "yolov8" and rows.shape[1] > len(rows) >= 5:
         raise ValueError("there are more classes than boxes: rows and columns are exchanged")
-    if kind == "yolov5" and classes.shape[1] == 1 and len(rows) and _whole(classes):
+    if kind == "yolov5" and classes.shape[1] == 1 and len(rows) and _are_kept(rows):
         raise ValueError("the last column holds whole numbers, as in output 'yolov10'")
     score = objectness * classes[:, class_id]
     _require_scores(score)
+    if not _shares(classes):
+        raise ValueError(
+            f"class scores are {_range(classes)}, expected 0 to 1: a model of outlines, keypoints "
+            "or turned boxes has more than classes behind its boxes; only one of plain boxes is "
+            "read"
+        )
     return rows[:, :4], np.where(classes[:, class_id] >= classes.max(axis=1), score, 0)
 
 
@@ -123,6 +130,15 @@ def _of_corners(rows: Floats, class_id: int) -> tuple[Floats, Floats]:
     rows = rows[rows[:, 5] == class_id]
     middle, extent = (rows[:, :2] + rows[:, 2:4]) / 2, rows[:, 2:4] - rows[:, :2]
     return np.column_stack([middle, extent]), rows[:, 4]
+
+
+def _are_kept(rows: Floats) -> bool:
+    """Whether rows end in score and class, the surest first, as after a suppression.
+
+    A single class scored 1 throughout tells nothing: so it is in float16, where YOLOv5 does not
+    train it.
+    """
+    return _whole(rows[:, 5]) and not ((rows[:, 5] == 1).all() and (np.diff(rows[:, 4]) > 0).any())
 
 
 def _require_scores(score: Floats) -> None:

@@ -26,6 +26,7 @@ def test_logits_become_the_softmax_of_scipy() -> None:
 
 @pytest.mark.parametrize("found", [
     softmax(LOGITS, axis=1), LOGITS.argmax(1), LOGITS.argmax(1).astype(np.uint8), LOGITS[:, 0] > 0,
+    LOGITS.argmax(1)[:, None].astype(np.float32),
 ])  # fmt: skip
 def test_what_is_no_logit_is_not_taken_for_one(found: np.ndarray) -> None:
     with pytest.raises(ValueError, match="which logits are not"):
@@ -44,6 +45,7 @@ def test_labels_are_whole_and_probabilities_within_one() -> None:
 
 @pytest.mark.parametrize(("found", "kind", "text"), [
     (KEPT, "yolov8", "rows and columns are exchanged"),
+    (BOX / 320, "yolov8", "rows and columns are exchanged"),
     (KEPT, "yolov5", "as in output 'yolov10'"),
     (BOX, "yolov8", "rows and columns are exchanged"),
     (BOX[..., :6], "yolov10", "the last column holds no classes"),
@@ -54,6 +56,29 @@ def test_labels_are_whole_and_probabilities_within_one() -> None:
 def test_boxes_of_another_layout_are_refused(found: np.ndarray, kind: str, text: str) -> None:
     with pytest.raises(ValueError, match=text):
         boxes_of(found, kind, 0)
+
+
+@pytest.mark.parametrize("behind", [
+    RNG.normal(0, 0.8, (400, 32)),  # of outlines
+    RNG.uniform(0, 320, (400, 51)),  # keypoints
+    RNG.uniform(-np.pi / 4, 3 * np.pi / 4, (400, 1)),  # the angle of turned boxes
+])  # fmt: skip
+def test_what_stands_behind_the_classes_is_no_class(behind: np.ndarray) -> None:
+    """As YOLO's models for other tasks have it: it was likelier than mushroom, and no cap was."""
+    rows = np.column_stack([BOX[0], behind])
+    with pytest.raises(ValueError, match="only one of plain boxes is read"):
+        boxes_of(rows.T[None], "yolov8", 0)
+    with pytest.raises(ValueError, match="only one of plain boxes is read"):
+        boxes_of(np.insert(rows, 4, 0.9, axis=1)[None], "yolov5", 0)
+
+
+def test_a_class_that_is_1_throughout_may_be_that_of_a_single_class() -> None:
+    """YOLOv5 does not train it, and in float16 its sigmoid of 11 is 1."""
+    rows = np.column_stack([BOX[0, :, :5], np.float16(1 / (1 + np.exp(-11))) * np.ones(400)])
+    assert boxes_of(rows[None], "yolov5", 0)[1] == pytest.approx(BOX[0, :, 4])
+    surest_first = rows[np.argsort(-rows[:, 4])]
+    with pytest.raises(ValueError, match="as in output 'yolov10'"):
+        boxes_of(surest_first[None], "yolov5", 0)
 
 
 def test_a_box_counts_for_its_likeliest_class_only() -> None:
