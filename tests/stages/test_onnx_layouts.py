@@ -45,7 +45,7 @@ def test_labels_are_whole_and_probabilities_within_one() -> None:
 
 @pytest.mark.parametrize(("found", "kind", "text"), [
     (KEPT, "yolov8", "rows and columns are exchanged"),
-    (BOX / 320, "yolov8", "rows and columns are exchanged"),
+    (BOX[..., :5] / 320, "yolov8", "rows and columns are exchanged"),
     (KEPT, "yolov5", "as in output 'yolov10'"),
     (BOX, "yolov8", "rows and columns are exchanged"),
     (BOX[..., :6], "yolov10", "the last column holds no classes"),
