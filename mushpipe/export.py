@@ -42,7 +42,7 @@ def read_picks(path: Path, topic: str | None = None) -> Iterator[tuple[Header, P
     """
     reader = RecordingReader(path)
     index = reader.index()
-    topics = sorted(t for t in index.channels if index.schema_name(t) == _SCHEMA)
+    topics = sorted(t for t in index.channels if index.table(t) == _SCHEMA)
     if topic is None and len(topics) > 1:
         raise UsageError(
             f"{path}: several topics hold picks: choose with --topic {' or --topic '.join(topics)}"

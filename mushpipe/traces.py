@@ -195,8 +195,8 @@ def _trace(frame: RgbdFrame, messages: list[Raw], order: list[str]) -> Trace:
         schema = raw.schema.name if raw.schema else ""
         if raw.channel.topic == TIMING_TOPIC:
             durations = stage_times(raw.message.data)
-        elif schema in TABLES:
-            decoded = decode_table(schema, raw.message.data)
+        elif raw.table in TABLES:
+            decoded = decode_table(raw.table, raw.message.data)
             outputs[stage] = (*outputs.get(stage, ()), decoded.table if decoded else None)
         elif schema == "foxglove.RawImage" and (image := _image(raw)) is not None:
             # what is not a stage's first output stands below its type

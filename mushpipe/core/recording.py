@@ -30,6 +30,7 @@ from mcap.summary import Summary
 from zstandard import ZstdError
 
 from mushpipe.core.errors import InputError, UsageError
+from mushpipe.core.truth import TABLE
 
 # What mcap's reader raises on bytes that are not what they claim to be.
 GARBAGE = (
@@ -60,6 +61,11 @@ class Raw(NamedTuple):
     schema: Schema | None
     message: McapMessage
 
+    @property
+    def table(self) -> str:
+        """Name of mushpipe's table that it is, by itself or as a subtype; or of its schema."""
+        return _table(self.channel, self.schema)
+
 
 @dataclass
 class Index:
@@ -78,6 +84,15 @@ class Index:
         """Return the name of a topic's schema, empty where it has none."""
         schema = self.schemas.get(self.channels[topic].schema_id)
         return schema.name if schema else ""
+
+    def table(self, topic: str) -> str:
+        """Return the name of mushpipe's table that a topic holds, or of its schema."""
+        channel = self.channels[topic]
+        return _table(channel, self.schemas.get(channel.schema_id))
+
+
+def _table(channel: Channel, schema: Schema | None) -> str:
+    return channel.metadata.get(TABLE) or (schema.name if schema else "")
 
 
 class RecordingReader:

@@ -80,6 +80,14 @@ class Truth(Columns):
 
 BUILT_IN = (Circles, Locations, Poses, Picks, Truth)
 """The tables that recordings know by name."""
+TABLE = "table"
+"""Metadata of a topic: which of them its table is, where that is a subtype of a plugin's."""
+
+
+def stands_for(table: type[Columns]) -> dict[str, str]:
+    """Return the metadata of a topic of tables: none, where its schema says all."""
+    base = next((base for base in table.__mro__ if base in BUILT_IN), table)
+    return {} if base is table else {TABLE: f"mushpipe.{base.__name__}"}
 
 
 @dataclass(frozen=True, eq=False)

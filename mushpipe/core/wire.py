@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mushpipe.core.geometry import Camera
 from mushpipe.core.tables import Columns
-from mushpipe.core.truth import BUILT_IN, Instances
+from mushpipe.core.truth import BUILT_IN, Instances, stands_for
 from mushpipe.core.types import Header, Mask, RgbdFrame
 
 COLOR_TOPIC = "/camera/color/image_raw"
@@ -204,7 +204,8 @@ def _encode_table(table: Columns, header: Header) -> Iterator[Message]:
     for name, value in columns.items():
         if isinstance(value, np.ndarray) and value.dtype.kind == "U":  # orjson knows numbers alone
             columns[name] = value.tolist()
-    yield json_message(table_schema(type(table)), header, columns)
+    message = json_message(table_schema(type(table)), header, columns)
+    yield message._replace(metadata=stands_for(type(table)))
 
 
 _ENCODERS: dict[type, Encoder] = {

@@ -175,8 +175,7 @@ def _choose(reader: RecordingReader, index: Index, topic: str | None) -> str:
     """Return the topic to judge: the picks, or else the circles."""
     path = reader.path
     groups = [
-        sorted(t for t in index.channels if index.schema_name(t) == schema)
-        for schema in (PICKS, CIRCLES)
+        sorted(t for t in index.channels if index.table(t) == schema) for schema in (PICKS, CIRCLES)
     ]
     known = [t for group in groups for t in group]
     if topic is not None and topic not in known:
@@ -191,9 +190,7 @@ def _choose(reader: RecordingReader, index: Index, topic: str | None) -> str:
 
 def _decode(path: Path, raw: Raw) -> tuple[Header, Columns]:
     try:
-        decoded = decode_table(
-            raw.schema.name if raw.schema else "", raw.message.data, raw.message.log_time
-        )
+        decoded = decode_table(raw.table, raw.message.data, raw.message.log_time)
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: a message on {raw.channel.topic}: {error}") from error
     if decoded is None:
