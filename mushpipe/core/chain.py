@@ -191,6 +191,16 @@ def _check_outputs(node: Node, values: tuple[Any, ...], frame: RgbdFrame) -> Non
         if (h, w) != (height, width):
             what = "mask" if isinstance(value, Mask) else "new frame"
             raise ValueError(f"its {what} is {w}x{h}, the frame {width}x{height}")
+        if isinstance(value, RgbdFrame) and _moment(value) != _moment(frame):
+            raise ValueError(
+                f"its new frame has stamp_ns and sequence {_moment(value)}, the frame "
+                f"{_moment(frame)}: what is found in it would count as of now; make it by "
+                "dataclasses.replace(frame, color=...)"
+            )
+
+
+def _moment(frame: RgbdFrame) -> tuple[int, int]:
+    return frame.header.stamp_ns, frame.header.sequence
 
 
 def _size(value: Any) -> tuple[int, ...] | None:

@@ -2,6 +2,7 @@
 
 import itertools
 import threading
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -198,6 +199,29 @@ def test_a_failing_stage_is_named_with_its_frame_and_reason(lab: Lab, stage, mes
     assert str(report.error) == f"stage 'b' (own-b) failed on frame 0: {message}"
     assert report.exit_code == 1
     assert counts(report) == (1, 0, 0, 1)
+
+
+def test_a_filter_that_is_a_frame_late_fails(lab: Lab):
+    """Robots would have what is found in the older image as of now."""
+
+    class Late(Stage):
+        _last: RgbdFrame | None = PrivateAttr(None)
+
+        def process(self, frame: RgbdFrame) -> RgbdFrame:
+            older, self._last = self._last or frame, frame
+            return older
+
+    report = lab.run(lab.chain(Late, "threshold"))
+    assert "'a' (own-a) failed on frame 1: ValueError: its new frame has stamp" in str(report.error)
+    assert counts(report)[3] == 1
+
+
+def test_a_filter_may_give_its_frame_another_frame_id(lab: Lab):
+    class Rectified(Stage):
+        def process(self, frame: RgbdFrame) -> RgbdFrame:
+            return replace(frame, header=replace(frame.header, frame_id="rectified"))
+
+    assert lab.run(lab.chain(Rectified, "threshold")).error is None
 
 
 def test_the_program_ends_with_1_where_a_stage_fails(lab: Lab, monkeypatch, capsys):
