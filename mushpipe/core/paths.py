@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, get_args
+from types import UnionType
+from typing import Annotated, Any, Union, get_args, get_origin
 
-from pydantic import AfterValidator, ValidationInfo
+from pydantic import AfterValidator, BaseModel, ValidationInfo
 from pydantic.fields import FieldInfo
 
 STDIO = Path("-")
@@ -44,5 +46,24 @@ SinkPath = Annotated[Path, AfterValidator(only_recording), AfterValidator(resolv
 def is_written(setting: FieldInfo) -> bool:
     """Whether a setting is a `SinkPath`, or that or None."""
     alternatives = (getattr(kind, "__metadata__", ()) for kind in get_args(setting.annotation))
-    validators = (each for group in (setting.metadata, *alternatives) for each in group)
+    return any(map(_of_sink, (setting.metadata, *alternatives)))
+
+
+def writes_within(kind: Any, within: bool = False, seen: tuple[Any, ...] = ()) -> bool:
+    """Whether a setting's type has a `SinkPath` within a list, a group or the like."""
+    if kind in seen:  # a group of such groups
+        return False
+    seen = (*seen, kind)
+    if get_origin(kind) is Annotated and _of_sink(kind.__metadata__):
+        return within
+    if isinstance(kind, type) and issubclass(kind, BaseModel):
+        fields = kind.model_fields.values()
+        return any(
+            is_written(field) or writes_within(field.annotation, True, seen) for field in fields
+        )
+    inside = within or get_origin(kind) not in (Union, UnionType, Annotated)
+    return any(writes_within(part, inside, seen) for part in get_args(kind))
+
+
+def _of_sink(validators: Iterable[Any]) -> bool:
     return any(getattr(each, "func", None) is only_recording for each in validators)

@@ -75,7 +75,9 @@ class Plan:
 
         def copy(node: Node) -> Node:
             # Built anew, not deep-copied: state may hold what cannot be copied, a lock say.
-            kind, settings = type(node.plugin), deepcopy(dict(node.plugin))
+            kind, plugin = type(node.plugin), node.plugin
+            fields = {name: getattr(plugin, name) for name in kind.model_fields}
+            settings = deepcopy({**fields, **(plugin.model_extra or {})})
             return replace(node, plugin=kind.model_construct(set(settings), **settings))
 
         return replace(

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from mushpipe.core.errors import PluginError
+from mushpipe.core.paths import writes_within
 from mushpipe.core.settings import WORDS, settings_of
 from mushpipe.core.stage import Kind, Plugin, Sink, Source, Stage, kind_of
 from mushpipe.core.table_type import table_fault
@@ -52,15 +53,10 @@ def ports_of(plugin: type[Plugin]) -> Ports:
 
     Raises:
         PluginError: The method is missing or cannot be called frame by frame, an annotation is
-            missing or not a class, a setting has a name that a graph could not set, or what it
-            returns could not be recorded.
+            missing or not a class, a setting has a name that a graph could not set or files that
+            nobody would look after, or what it returns could not be recorded.
     """
-    for name in settings_of(plugin):
-        if name in WORDS:
-            raise PluginError(
-                f"{plugin.__qualname__}: a setting cannot be called '{name}', which in a graph "
-                "stands beside the settings; give it another name, or an alias"
-            )
+    _check_settings(plugin)
     if plugin.__pydantic_custom_init__:
         raise PluginError(
             f"{plugin.__qualname__} has an __init__, without which a run makes its copy: set state "
@@ -86,6 +82,22 @@ def ports_of(plugin: type[Plugin]) -> Ports:
     inputs = tuple(port for port in ports if port.name not in random)
     outputs = _outputs(plugin, hints) if kind == "stage" else ()
     return Ports(inputs, outputs, random[0] if random else None)
+
+
+def _check_settings(plugin: type[Plugin]) -> None:
+    """Raise PluginError where a graph could not set a setting, or a run not look after it."""
+    for name in settings_of(plugin):
+        if name in WORDS:
+            raise PluginError(
+                f"{plugin.__qualname__}: a setting cannot be called '{name}', which in a graph "
+                "stands beside the settings; give it another name, or an alias"
+            )
+    for name, field in plugin.model_fields.items():
+        if writes_within(field.annotation):
+            raise PluginError(
+                f"{plugin.__qualname__}: setting '{name}' has a SinkPath within another type, "
+                "where nobody keeps it from what is read: make it a setting of its own"
+            )
 
 
 def _check_calls(plugin: type[Plugin], kind: Kind) -> None:

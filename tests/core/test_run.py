@@ -3,13 +3,14 @@
 import itertools
 import threading
 from dataclasses import replace
-from typing import NamedTuple
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 from pydantic import PrivateAttr
 
-from mushpipe import Circles, InputError, Mask, RgbdFrame, Sink, Stage
+from mushpipe import Circles, InputError, Mask, Poses, RgbdFrame, Sink, Stage
 from mushpipe.core.run import run
 from tests.core.lab import Dice, Frames, Lab, circles, cli, make_frame
 
@@ -67,6 +68,21 @@ def test_each_run_has_fresh_state(lab: Lab):
     for _ in range(2):
         assert run(plan).error is None
     assert [trace.outputs["a"][0].radius[0] for trace in lab.seen] == [1, 2, 3] * 2
+
+
+def test_what_a_plugin_remembers_of_the_time_before_a_run_is_none_of_it(lab: Lab):
+    class Remembers(Stage):
+        @cached_property
+        def lock(self) -> Any:
+            return threading.Lock()
+
+        def required_inputs(self) -> frozenset[str]:
+            return frozenset() if self.lock else frozenset({"poses"})
+
+        def process(self, frame: RgbdFrame, poses: Poses | None) -> Mask:
+            return Mask(frame.gray > 0)
+
+    assert lab.run(lab.chain(Remembers)).error is None
 
 
 def test_a_settings_list_is_not_shared_between_runs(lab: Lab):

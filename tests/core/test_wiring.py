@@ -6,10 +6,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from pydantic import BaseModel
 
 from mushpipe import (
     Circles,
     Columns,
+    GraphPath,
     Locations,
     Mask,
     Picks,
@@ -17,6 +19,7 @@ from mushpipe import (
     RgbdFrame,
     RunInfo,
     Sink,
+    SinkPath,
     Stage,
     Trace,
     column,
@@ -195,6 +198,41 @@ def test_a_setting_that_a_graph_could_not_set(lab: Lab, word: str):
     fault = lab.faults("mushpipe: 1\nsource: {use: frames}\nstages:\n  a: {use: greedy}\n")
     assert fault.startswith("graph.yaml:4:12: ")
     assert f"Greedy: a setting cannot be called '{word}', which in a graph stands" in fault
+
+
+class Group(BaseModel):
+    out: SinkPath
+    more: "list[Group]" = []
+
+
+class Harmless(BaseModel):
+    model: GraphPath
+    more: "list[Harmless]" = []
+
+
+@pytest.mark.parametrize(
+    "kind", [list[SinkPath], dict[str, SinkPath] | None, tuple[SinkPath, int], Group, list[Group]]
+)
+def test_a_path_to_write_that_nobody_would_look_after_is_refused(kind: Any):
+    """It could be that of the recording which is played."""
+
+    class Lists(Sink):
+        paths: kind
+
+        def consume(self, frame: RgbdFrame) -> None: ...
+
+    with pytest.raises(PluginError, match="'paths' has a SinkPath within another type"):
+        ports_of(Lists)
+
+
+@pytest.mark.parametrize("kind", [SinkPath, SinkPath | None, list[GraphPath], Harmless])
+def test_other_paths_are_settings(kind: Any):
+    class Writes(Sink):
+        path: kind
+
+        def consume(self, frame: RgbdFrame) -> None: ...
+
+    assert ports_of(Writes).inputs
 
 
 def test_state_made_by_a_constructor_is_refused():
