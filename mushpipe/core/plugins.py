@@ -11,7 +11,8 @@ import sys
 import traceback
 import zlib
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field
 from importlib.abc import Loader
 from importlib.machinery import ModuleSpec
@@ -37,6 +38,13 @@ class _Hooks:
     @hookspec
     def mushpipe_register(self, registry: Registry) -> None:
         """Register plugins by calling ``registry.stage(name, target)`` and its siblings."""
+
+
+@contextmanager
+def prints_aside() -> Iterator[None]:
+    """Send what plugins print to stderr: standard output is for results, a recording maybe."""
+    with redirect_stdout(sys.stderr):
+        yield
 
 
 @dataclass(frozen=True)
@@ -187,11 +195,12 @@ def register(registry: Registry, points: Iterable[EntryPoint]) -> None:
         before = sum(map(len, registry.entries.values()))
         module = None
         try:
-            module = point.load()
-            manager.register(module)
-            manager.check_pending()
-            others = manager.get_plugins() - {module}
-            manager.subset_hook_caller("mushpipe_register", others)(registry=registry)
+            with prints_aside():
+                module = point.load()
+                manager.register(module)
+                manager.check_pending()
+                others = manager.get_plugins() - {module}
+                manager.subset_hook_caller("mushpipe_register", others)(registry=registry)
             if sum(map(len, registry.entries.values())) == before:
                 raise PluginError("it registers nothing: is @mushpipe.hookimpl missing?")
         except (Exception, SystemExit) as error:
@@ -212,7 +221,8 @@ def _brief(error: BaseException) -> str:
 
 def _import(target: str) -> Any:
     module, _, name = target.partition(":")
-    return getattr(importlib.import_module(module), name)
+    with prints_aside():
+        return getattr(importlib.import_module(module), name)
 
 
 def in_file(use: str) -> bool:
@@ -255,7 +265,8 @@ def _module_of_file(path: Path) -> ModuleType:
     module = importlib.util.module_from_spec(cast(ModuleSpec, spec))
     sys.modules[module_name] = module
     try:
-        cast(Loader, cast(ModuleSpec, spec).loader).exec_module(module)
+        with prints_aside():
+            cast(Loader, cast(ModuleSpec, spec).loader).exec_module(module)
     except (Exception, SystemExit) as error:
         del sys.modules[module_name]
         raise PluginError(f"{path} cannot be imported: {_brief(error)}") from error

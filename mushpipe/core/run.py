@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 
 from mushpipe.core.capsule import write_capsule
@@ -24,6 +24,7 @@ from mushpipe.core.errors import InputError, MushpipeError, StageError
 from mushpipe.core.manifest import build_manifest
 from mushpipe.core.overwriting import spare_files
 from mushpipe.core.plan import Node, Plan
+from mushpipe.core.plugins import prints_aside
 from mushpipe.core.report import Durations, RunReport
 from mushpipe.core.stage import Plugin, RunInfo, Sink, Source, Stage
 from mushpipe.core.types import RgbdFrame
@@ -286,7 +287,8 @@ def _opener(node: Node, info: RunInfo | None = None) -> Callable[[], None]:
 @contextmanager
 def _opened(node: Node, opener: Callable[[], None]) -> Iterator[Plugin]:
     try:
-        with named(node):
+        # a sink may open standard output itself
+        with named(node), nullcontext() if node.kind == "sink" else prints_aside():
             opener()
         yield node.plugin
     except BaseException:

@@ -201,10 +201,11 @@ def _up(gravity: str) -> tuple[float, ...]:
 
 def _run(plan: Plan) -> RunReport:
     from mushpipe.console import interruptible, progress_bar
+    from mushpipe.core.plugins import prints_aside
     from mushpipe.core.run import run
 
     stop = threading.Event()
-    with interruptible(stop), progress_bar() as show:
+    with interruptible(stop), progress_bar() as show, prints_aside():
         report = run(plan, stop, show)
     if report.interrupted:
         raise typer.Exit(report.exit_code)

@@ -36,8 +36,12 @@ sinks:
 SAY = """\
 import os
 from mushpipe import RgbdFrame, Stage
+print("imported", flush=True)
 
 class Say(Stage):
+    def open(self) -> None:
+        print("opened", flush=True)
+
     def process(self, frame: RgbdFrame) -> RgbdFrame:
         os.write(1, b"frame\\n")
         print("frame", flush=True)

@@ -63,6 +63,14 @@ def test_an_installed_package_is_found_beside_the_builtin_ones(site):
     assert {"otsu", "hough", "picks"} < set(registry.names("stage"))
 
 
+def test_what_a_package_prints_on_import_is_no_output(site, capsys):
+    """It would stand before the first byte of `record -o -`, or within JSON."""
+    install(site, "fungus", "print('hello')\n" + GOOD.replace("Nothing)", "'fungus.more:Late')"))
+    (site / "fungus" / "more.py").write_text("print('late')\nfrom fungus import Nothing as Late")
+    find(load_registry(), "nothing")
+    assert capsys.readouterr() == ("", "hello\nlate\n")
+
+
 def test_builtin_plugins_are_not_imported_before_they_are_used():
     registry = load_registry()
     (entry,) = registry.entries["stage", "otsu"]
