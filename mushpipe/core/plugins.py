@@ -134,7 +134,7 @@ class Registry:
         found = [
             entry
             for entry in self.entries.get((kind, name), [])
-            if distribution in ("", entry.distribution)
+            if _normal(distribution) in ("", _normal(entry.distribution))
         ]
         if len(found) == 1:
             return found[0].load()

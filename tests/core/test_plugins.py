@@ -179,6 +179,12 @@ def test_a_package_is_meant_however_its_name_is_written(site, monkeypatch, wante
     assert "one" in load_registry().names("stage")
 
 
+@pytest.mark.parametrize("use", ["My_Fungus:nothing", "my-fungus:nothing", "my.fungus:nothing"])
+def test_whose_plugin_is_meant_may_be_written_as_pip_takes_it(site, use):
+    install(site, "My_Fungus", GOOD)
+    assert find(load_registry(), use).__module__ == "My_Fungus"
+
+
 def test_an_unknown_name_may_be_left_out_by_the_environment(site, monkeypatch):
     monkeypatch.setenv("MUSHPIPE_PLUGINS", "no-such-thing")
     with pytest.raises(PluginError, match="only plugins of MUSHPIPE_PLUGINS=no-such-thing are"):
