@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,9 @@ from typing import Any
 from mushpipe.core.errors import MushpipeError, PluginError, StageError
 from mushpipe.core.mailbox import Mailbox
 from mushpipe.core.plan import Node, Plan
-from mushpipe.core.plugins import in_file
+from mushpipe.core.plugins import in_file, prints_aside
 from mushpipe.core.report import Durations, SinkReport
-from mushpipe.core.stage import ReplaySource, RunInfo, Sink, Source
+from mushpipe.core.stage import Plugin, ReplaySource, RunInfo, Sink, Source, Stage
 from mushpipe.core.types import RgbdFrame
 
 logger = logging.getLogger("mushpipe")
@@ -46,6 +47,11 @@ def named(node: Node) -> Iterator[None]:
         raise
     except Exception as error:
         raise failure(node, None, error) from error
+
+
+def plain(value: object) -> Any:
+    """Return what a plugin says of itself as data of JSON; numbers of numpy become plain ones."""
+    return json.loads(json.dumps(value, default=lambda v: getattr(v, "tolist", v.__str__)()))
 
 
 def files_read(plan: Plan) -> tuple[Path, ...]:
@@ -146,6 +152,30 @@ def interruptible_opening(source: Source, stop: threading.Event) -> Iterator[Non
     finally:
         opened.set()
         watcher.join()
+
+
+def opener(node: Node, info: RunInfo | None = None) -> Callable[[], None]:
+    """Return what opens a node for a run."""
+    plugin = node.plugin
+    if isinstance(plugin, Sink) and info is not None:
+        return lambda: plugin.open(info)
+    return plugin.open if isinstance(plugin, Stage | Source) else lambda: None
+
+
+@contextmanager
+def opened(node: Node, opener: Callable[[], None]) -> Iterator[Plugin]:
+    """Open a node, and close it on leaving, whether or not that worked."""
+    try:
+        # a sink may open standard output itself
+        with named(node), nullcontext() if node.kind == "sink" else prints_aside():
+            opener()
+        yield node.plugin
+    except BaseException:
+        with suppress(Exception):  # the first error is the one to report
+            node.plugin.close()
+        raise
+    with named(node):
+        node.plugin.close()
 
 
 class SourceThread(threading.Thread):

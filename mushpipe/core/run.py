@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 from mushpipe.core.capsule import write_capsule
 from mushpipe.core.chain import Chain, Passage, Turnstile, cores_shared, sink_inputs
@@ -19,14 +20,16 @@ from mushpipe.core.edges import (
     files_read,
     interruptible_opening,
     named,
+    opened,
+    opener,
+    plain,
 )
 from mushpipe.core.errors import InputError, MushpipeError, StageError
 from mushpipe.core.manifest import build_manifest
 from mushpipe.core.overwriting import spare_files
 from mushpipe.core.plan import Node, Plan
-from mushpipe.core.plugins import prints_aside
 from mushpipe.core.report import Durations, RunReport
-from mushpipe.core.stage import Plugin, RunInfo, Sink, Source, Stage
+from mushpipe.core.stage import RunInfo, Sink, Source
 from mushpipe.core.types import RgbdFrame
 
 logger = logging.getLogger("mushpipe")
@@ -94,7 +97,7 @@ class _Runner:
             self.report.manifest = build_manifest(self.plan)
         with ExitStack() as stack:
             with interruptible_opening(source, self.stop):
-                stack.enter_context(_opened(self.plan.source, _opener(self.plan.source)))
+                stack.enter_context(opened(self.plan.source, opener(self.plan.source)))
             durations = self.report.durations[self.plan.source.name]
             reader = SourceThread(self.plan.source, source, threading.Event(), durations)
             info = self._begin(source, reader)
@@ -103,7 +106,7 @@ class _Runner:
             # Who writes a file empties it: not before all that may fail without has opened.
             sinks = sorted(self.plan.sinks, key=lambda node: bool(written[node.name]))
             for node in (*self.plan.stages, *sinks):
-                stack.enter_context(_opened(node, _opener(node, info)))
+                stack.enter_context(opened(node, opener(node, info)))
             self.report.files = tuple(path for paths in written.values() for path in paths)
             self.report.opened = True
             self.started = time.monotonic()  # what opening took is no part of the frames' pace
@@ -122,7 +125,7 @@ class _Runner:
         on_error = self.plan.on_error or ("fail" if self.plan.replay() else "skip")
         self.tolerance = self.plan.max_failures if on_error == "skip" else 1
         with named(self.plan.source):
-            device = self.report.device = source.describe()
+            device = self.report.device = plain(source.describe())
             manifest = {**self.report.manifest, **({"device": device} if device else {})}
             return RunInfo(source.name(), manifest, source.live, lambda: reader.box.accepted)
 
@@ -239,7 +242,7 @@ class _Runner:
         """Stop the threads, let the sinks finish what they were handed, and settle the counts."""
         reader.stop.set()
         reader.box.close()
-        source.interrupt()
+        self._ask(source.interrupt)
         for thread in threads:
             thread.box.close()
         for edge in (reader, *threads):
@@ -249,7 +252,7 @@ class _Runner:
         self.report.read, self.report.dropped = reader.box.accepted, reader.box.dropped
         self.report.waiting = reader.box.waiting + self.late
         self.report.elapsed_s = time.monotonic() - self.started
-        self.report.source = source.counts()
+        self.report.source = self._ask(source.counts) or {}
         for thread in threads:
             self.report.sinks[thread.node.name] = thread.report()
             if thread.error is not None:
@@ -265,6 +268,14 @@ class _Runner:
             text = f"source '{self.plan.source.use}' gave no frame: there is nothing to run on"
             self.report.error = InputError(text)
 
+    def _ask(self, method: Callable[[], Any]) -> Any:
+        """Call a method of the source; where that fails, the sinks still get to their end."""
+        try:
+            with named(self.plan.source):
+                return plain(method())
+        except MushpipeError as error:
+            self.report.error = self.report.error or error
+
     def _save_capsule(self, node: Node, frame: RgbdFrame, error: Exception) -> None:
         if self.capsules is None or node.name in self.saved:
             return
@@ -275,25 +286,3 @@ class _Runner:
             logger.warning("the failing frame could not be saved: %s", trouble)
         else:
             self.report.capsules.append(str(path))
-
-
-def _opener(node: Node, info: RunInfo | None = None) -> Callable[[], None]:
-    plugin = node.plugin
-    if isinstance(plugin, Sink) and info is not None:
-        return lambda: plugin.open(info)
-    return plugin.open if isinstance(plugin, Stage | Source) else lambda: None
-
-
-@contextmanager
-def _opened(node: Node, opener: Callable[[], None]) -> Iterator[Plugin]:
-    try:
-        # a sink may open standard output itself
-        with named(node), nullcontext() if node.kind == "sink" else prints_aside():
-            opener()
-        yield node.plugin
-    except BaseException:
-        with suppress(Exception):  # the first error is the one to report
-            node.plugin.close()
-        raise
-    with named(node):
-        node.plugin.close()

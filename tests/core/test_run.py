@@ -1,9 +1,11 @@
 """The loop: order, fresh state, checks of what stages return, and the balance of frames."""
 
 import itertools
+import json
 import threading
 from dataclasses import replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,6 +54,36 @@ def test_max_frames_ends_the_run_and_closes_the_source(lab: Lab):
     report = lab.run(lab.chain("threshold", source="endless"), "source.max_frames=4")
     assert counts(report) == (4, 4, 0, 0)
     assert closed == [True]
+
+
+@pytest.mark.parametrize("method", ["interrupt", "counts"])
+def test_a_source_that_fails_at_the_end_costs_no_sink_its_frames(lab: Lab, method: str):
+    """As that of a driver which is stopped already."""
+
+    def gone(self: Any) -> Any:
+        raise OSError("device gone")
+
+    lab.registry.source("going", type("Going", (Frames,), {method: gone}))
+    report = lab.run(lab.chain("threshold", source="going"))
+    assert str(report.error) == "source 'source' (going) failed: OSError: device gone"
+    assert counts(report) == (3, 3, 0, 0)
+    assert [trace.frame.header.sequence for trace in lab.seen] == [0, 1, 2]
+    assert report.sinks["out"].consumed == 3
+
+
+def test_what_a_source_says_of_itself_may_hold_numbers_of_numpy(lab: Lab):
+    class Said(Frames):
+        def describe(self) -> dict[str, Any]:
+            return {"serial": np.int64(4), "matrix": np.eye(2), "file": Path("a")}
+
+        def counts(self) -> dict[str, int]:
+            return {"lost": np.uint8(3)}
+
+    lab.registry.source("said", Said)
+    report = lab.run(lab.chain("threshold", source="said"))
+    assert report.error is None
+    known = {"serial": 4, "matrix": [[1, 0], [0, 1]], "file": "a"}
+    assert json.loads(json.dumps([report.device, report.source])) == [known, {"lost": 3}]
 
 
 def test_each_run_has_fresh_state(lab: Lab):
