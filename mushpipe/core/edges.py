@@ -45,7 +45,7 @@ def named(node: Node) -> Iterator[None]:
         yield
     except MushpipeError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise failure(node, None, error) from error
 
 

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import sys
 import threading
 from dataclasses import replace
 from functools import cached_property
@@ -14,7 +15,7 @@ from pydantic import PrivateAttr
 
 from mushpipe import Circles, InputError, Mask, Poses, RgbdFrame, Sink, Stage
 from mushpipe.core.run import run
-from tests.core.lab import Dice, Frames, Lab, circles, cli, make_frame
+from tests.core.lab import Both, Dice, Frames, Lab, circles, cli, make_frame
 
 
 def counts(report) -> tuple[int, int, int, int]:
@@ -247,6 +248,15 @@ def test_a_failing_stage_is_named_with_its_frame_and_reason(lab: Lab, stage, mes
     assert str(report.error) == f"stage 'b' (own-b) failed on frame 0: {message}"
     assert report.exit_code == 1
     assert counts(report) == (1, 0, 0, 1)
+
+
+@pytest.mark.parametrize("method", ["open", "close"])
+def test_a_stage_that_leaves_as_a_program_does_fails(lab: Lab, method: str):
+    """With 0, as scripts end, nothing was run and the program ended as if all were fine."""
+    leaving = {method: lambda self: sys.exit(0)}
+    report = lab.run(lab.chain(type("Leaves", (Both,), leaving)))
+    assert str(report.error) == "stage 'a' (own-a) failed: SystemExit: 0"
+    assert report.exit_code == 1
 
 
 def test_a_filter_that_is_a_frame_late_fails(lab: Lab):
