@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import json
 import sys
 from collections.abc import Iterator, Sequence
@@ -251,6 +252,7 @@ def main() -> None:
     """Entry point: errors meant for the user become one message and an exit code."""
     from mushpipe.core.errors import MushpipeError
 
+    faulthandler.enable(file=2)  # where native code of a plugin crashes, which one it was
     try:
         app()
     except MushpipeError as error:

@@ -55,3 +55,16 @@ def test_one_signal_ends_the_run_in_order(tmp_path: Path, number: signal.Signals
     assert summary is not None
     assert summary.statistics is not None
     assert f"{summary.statistics.message_count // 2} processed" in stderr
+
+
+def test_where_native_code_crashes_is_told(tmp_path: Path) -> None:
+    """A library of a plugin may abort; that was all one saw of it."""
+    (tmp_path / "graph.yaml").write_text(GRAPH)
+    crash = SAY.replace("import sys", "import os").replace(
+        'sys.stdout.write("frame\\n"); sys.stdout.flush()', "os.abort()"
+    )
+    (tmp_path / "say.py").write_text(crash)
+    command = [sys.executable, "-m", "mushpipe", "run", "graph.yaml"]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ended.returncode == -signal.SIGABRT
+    assert f'File "{tmp_path / "say.py"}", line 6 in process' in ended.stderr
