@@ -190,7 +190,7 @@ def register(registry: Registry, points: Iterable[EntryPoint]) -> None:
     """Load entry points into the registry; a failure becomes a row of ``registry.broken``."""
     manager = pluggy.PluginManager(GROUP)
     manager.add_hookspecs(_Hooks)
-    for point in points:
+    for point in {(_owner(p), p.value): p for p in points}.values():  # each module once
         distribution, version = registry._owner = _owner(point)
         before = sum(map(len, registry.entries.values()))
         module = None

@@ -216,6 +216,15 @@ def test_two_plugins_of_one_name_must_be_told_apart(site, monkeypatch, capsys):
     assert find(registry, "bbb:nothing").__module__ == "bbb"
 
 
+def test_a_package_may_name_its_module_once_per_stage(site):
+    install(site, "fungus", GOOD)
+    points = site / "fungus-1.2.dist-info" / "entry_points.txt"
+    points.write_text("[mushpipe]\nnothing = fungus\nsomething = fungus\n")
+    registry = load_registry()
+    assert registry.broken == []
+    assert find(registry, "nothing").__module__ == "fungus"
+
+
 def test_an_entry_point_without_a_distribution():
     registry = Registry()
     register(registry, [EntryPoint("builtin", "mushpipe.builtin", "mushpipe")])
