@@ -30,7 +30,9 @@ def locked(array: Any, dtype: Any) -> NDArray[Any]:
     owner = result
     while isinstance(owner.base, np.ndarray):
         owner = owner.base
-    if owner.base is not None and owner.flags.writeable:
+    # numba's is reached through its arrays alone
+    foreign = owner.base is not None and type(owner.base).__name__ != "_MemInfo"
+    if foreign and owner.flags.writeable:
         result = result.copy()
     part: Any = result
     while isinstance(part, np.ndarray):

@@ -289,3 +289,10 @@ def test_empty_lists_are_tables_without_rows():
     circles = Circles([], [], [])
     assert len(circles) == 0
     assert circles.center.shape == (0, 2)
+
+
+def test_memory_of_numbas_is_not_copied():
+    from numba import njit
+
+    array = njit(lambda: np.zeros(3))()
+    assert locked(array, np.float64) is array
