@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr
@@ -22,7 +20,7 @@ from mushpipe import (
 from mushpipe.core.geometry import lengths
 from mushpipe.stages.cap_batch import Fits, fit_caps
 from mushpipe.stages.cap_clod import CLOD_CHANCE, clods
-from mushpipe.stages.cap_gap import edge_gaps
+from mushpipe.stages.cap_gap import EdgeWatch
 from mushpipe.stages.cap_kin import FEWEST, kin_of, unlike
 from mushpipe.stages.cap_order import Order, by_depth
 from mushpipe.stages.cap_solve import Noise
@@ -32,12 +30,8 @@ from mushpipe.stages.surface_fit import fit_tops, sources, variance_along, witho
 from mushpipe.stages.upright import Up, pixel_rays, upright
 from mushpipe.stages.warm_up import example_circles, example_frame
 
-logger = logging.getLogger("mushpipe")
 Floats = NDArray[np.float64]
 LEAST = 8  # points that a surface over a hole needs
-# Of edges in depth beside those in colour: enough to judge by, in so many frames at most, and how
-# far from what was stated they may lie, px. At two, diameters are 1.5 mm off.
-ENOUGH, PATIENCE, AMISS = 200, 60, 1.2
 
 
 class CapFit(Stage):
@@ -78,7 +72,7 @@ class CapFit(Stage):
         "scores",
     )
 
-    _gaps: list[Floats] | None = PrivateAttr(default_factory=list)  # None once they were judged
+    _edges: EdgeWatch = PrivateAttr(default_factory=EdgeWatch)
 
     def open(self) -> None:
         """Compile the kernels, and read the verifier if it is asked."""
@@ -86,7 +80,7 @@ class CapFit(Stage):
         self.process(frame, circles)
         if self.min_score is not None:
             self.scores(frame, circles.take(np.zeros(FEWEST, np.intp)))
-        self._gaps = []
+        self._edges = EdgeWatch()
 
     def process(self, frame: RgbdFrame, circles: Circles) -> tuple[Locations, Poses, Circles]:
         """Return one location and one pose per circle, and the circles, improved.
@@ -113,32 +107,8 @@ class CapFit(Stage):
         if len(holes):
             self._bridge(holes, fits, depth, frame.camera, circles, order)
         found = self._kept(_locations(fits, source.astype(np.uint8)), _poses(fits), circles)
-        self._watch_edges(frame, found[-1])
+        self._edges.look(frame, found[-1], self.edge_offset_px)
         return found
-
-    def _watch_edges(self, frame: RgbdFrame, circles: Circles) -> None:
-        """Warn, once, where depth shows caps larger or smaller than `edge_offset_px` says."""
-        if self._gaps is None:
-            return
-        self._gaps.append(edge_gaps(frame, circles))
-        gaps = np.sort(np.concatenate(self._gaps))
-        if len(gaps) < ENOUGH and len(self._gaps) < PATIENCE:
-            return
-        self._gaps = None
-        if len(gaps) < ENOUGH:
-            return
-        lost = -float(gaps[len(gaps) // 4 : -len(gaps) // 4].mean())  # a fourth may be anything
-        if abs(lost - self.edge_offset_px) > AMISS:
-            logger.warning(
-                "cap-fit: edges of caps in depth lie %.1f px %s of those in colour, where "
-                "edge_offset_px: %g takes them for %.1f px %s; diameters are too %s: set "
-                "edge_offset_px: %.1f, and measure a ball of known diameter",
-                *_told(lost),
-                self.edge_offset_px,
-                *_told(self.edge_offset_px),
-                "large" if lost < self.edge_offset_px else "small",
-                np.clip(lost, -3, 3),
-            )
 
     def scores(self, frame: RgbdFrame, circles: Circles, fits: Fits | None = None) -> Floats:
         """Return how likely circles (N,) are caps; without `min_score` the scores they have.
@@ -227,10 +197,6 @@ class CapFit(Stage):
         along = variance_along(without_tip(*tops)[0], tops[1], size, pixel)
         fits.surface[rows] = camera.deproject(discs[:, :2], z)
         fits.sigma_surface[rows, 2] = np.maximum(fits.sigma_surface[rows, 2], np.sqrt(along))
-
-
-def _told(lost: float) -> tuple[float, str]:
-    return abs(lost), "inside" if lost > 0 else "outside"
 
 
 def _locations(fits: Fits, source: NDArray[np.uint8]) -> Locations:

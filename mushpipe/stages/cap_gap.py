@@ -1,10 +1,13 @@
-"""How far outside of the edges of caps in colour those in depth lie.
+"""Where depth shows the edges of caps, beside where colour shows them.
 
 A structured-light camera loses a little of each edge, a stereo camera shows caps wider than they
-are, by what it matches at once. `cap-fit` takes that off, if it is told by how much.
+are, by what it matches at once: `cap-fit` takes that off, if it is told by how much. And where
+depth is aligned badly to colour, all edges are shifted.
 """
 
 from __future__ import annotations
+
+import logging
 
 import cv2
 import numpy as np
@@ -12,7 +15,12 @@ from numpy.typing import NDArray
 
 from mushpipe import Circles, RgbdFrame
 
+logger = logging.getLogger("mushpipe")
 Floats = NDArray[np.float64]
+# Edges: enough to judge by, in so many frames at most, and how far from what was stated they may
+# lie, px. At two, diameters are 1.5 mm off, and axes by 2 degrees more.
+ENOUGH, PATIENCE, AMISS, SHIFTED = 100, 60, 1.5, 2.0
+_OUTLIER = 2.0  # px from what is usual
 MOST, LEAST_RADIUS = 40, 14  # circles that are looked at: so many, of this radius, px, or more
 _DIRECTIONS, _STEP = 32, 0.5  # px between places along a direction
 _REACH, _SHARE = 8.0, 0.3  # looked at to both sides of a circle: px, or share of its radius
@@ -21,10 +29,73 @@ _WIDE = 2  # steps to either side that a fall of luma is taken over
 _LEAST_FALL = 0.06  # of luma
 
 
-def edge_gaps(frame: RgbdFrame, circles: Circles) -> Floats:
-    """Return by how much edges in depth lie outside of those in colour (K,), px.
+class EdgeWatch:
+    """Looks at edges of caps until it can judge where depth shows them; tells what is amiss."""
 
-    Looked for along 32 directions across the largest circles, where all of the depth is known.
+    def __init__(self) -> None:
+        self._gaps: list[Floats] | None = []  # None once they were judged
+
+    def look(self, frame: RgbdFrame, circles: Circles, edge_offset_px: float) -> None:
+        """Look at a frame; warn, once, where depth shows caps otherwise than colour.
+
+        Args:
+            frame: With depth and calibration.
+            circles: Outlines of caps.
+            edge_offset_px: How much of an edge depth is said to lose, px.
+        """
+        if self._gaps is None:
+            return
+        self._gaps.append(edge_gaps(frame, circles))
+        gaps = np.concatenate(self._gaps)
+        if len(gaps) < ENOUGH and len(self._gaps) < PATIENCE:
+            return
+        self._gaps = None
+        if len(gaps) >= ENOUGH:
+            wider, *shift = usual(gaps)
+            _tell(-wider, edge_offset_px, (shift[0], shift[1]))
+
+
+def _tell(lost: float, stated: float, shift: tuple[float, float]) -> None:
+    if np.hypot(*shift) > SHIFTED:
+        logger.warning(
+            "cap-fit: depth shows caps %.1f px to the %s and %.1f px %s of where colour shows "
+            "them: it is not aligned to colour, and positions and axes are wrong; calibrate the "
+            "cameras anew",
+            *(abs(shift[0]), "right" if shift[0] > 0 else "left"),
+            *(abs(shift[1]), "below" if shift[1] > 0 else "above"),
+        )
+    if abs(lost - stated) > AMISS:
+        logger.warning(
+            "cap-fit: edges of caps in depth lie %.1f px %s of those in colour, where "
+            "edge_offset_px: %g takes them for %.1f px %s; diameters are too %s: set "
+            "edge_offset_px: %.1f, and measure a ball of known diameter",
+            *(abs(lost), "inside" if lost > 0 else "outside"),
+            stated,
+            *(abs(stated), "inside" if stated > 0 else "outside"),
+            "large" if lost < stated else "small",
+            np.clip(lost, -3, 3),
+        )
+
+
+def usual(gaps: Floats) -> Floats:
+    """Return by how much depth shows caps wider than colour (3,), px, and shifted along x and y.
+
+    Args:
+        gaps: (K, 3) from `edge_gaps`.
+    """
+    basis = np.column_stack([np.ones(len(gaps)), gaps[:, 1:]])
+    found = np.array([np.median(gaps[:, 0]), 0.0, 0.0])
+    for reach in (4 * _OUTLIER, 2 * _OUTLIER, _OUTLIER, _OUTLIER):
+        near = np.abs(gaps[:, 0] - basis @ found) <= reach
+        found = np.linalg.lstsq(basis[near], gaps[near, 0], rcond=None)[0]
+    return found
+
+
+def edge_gaps(frame: RgbdFrame, circles: Circles) -> Floats:
+    """Return by how much edges in depth lie outside of those in colour, and where (K, 3).
+
+    Distance, px, and direction from the centre, x and y of a unit vector. Looked for along 32
+    directions across the largest circles, where all of the depth is known.
 
     Args:
         frame: With depth and calibration.
@@ -39,7 +110,7 @@ def edge_gaps(frame: RgbdFrame, circles: Circles) -> Floats:
         _gaps(frame.gray, depth, frame.camera.fx, circles.center[k], float(circles.radius[k]))
         for k in large
     ]
-    return np.concatenate([np.zeros(0), *found])
+    return np.concatenate([np.zeros((0, 3)), *found])
 
 
 def _gaps(
@@ -48,16 +119,17 @@ def _gaps(
     reach = min(_REACH, _SHARE * radius)
     away = np.arange(-reach, reach + 1e-6, _STEP)
     angle = np.arange(_DIRECTIONS)[:, None] * (2 * np.pi / _DIRECTIONS)
-    x = (center[0] + np.cos(angle) * (radius + away)).astype(np.float32)
-    y = (center[1] + np.sin(angle) * (radius + away)).astype(np.float32)
+    direction = np.hstack([np.cos(angle), np.sin(angle)])
+    x, y = (center[i] + direction[:, i : i + 1] * (radius + away) for i in (0, 1))
+    x, y = x.astype(np.float32), y.astype(np.float32)
     height, width = gray.shape
     inside = ((x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)).all(axis=1)
     luma = cv2.remap(gray, x[inside], y[inside], cv2.INTER_LINEAR)
     z = cv2.remap(depth, x[inside], y[inside], cv2.INTER_NEAREST)
     known = (z > 0).all(axis=1)
-    luma, z = luma[known], z[known]
+    luma, z, direction = luma[known], z[known], direction[inside][known]
     if not len(z):
-        return np.zeros(0)
+        return np.zeros((0, 3))
     rows = np.arange(len(z))
     drop = z[:, 2:] - z[:, :-2]
     edge = drop.argmax(axis=1)
@@ -68,4 +140,5 @@ def _gaps(
     good = (drop[rows, edge] >= least) & (fall[rows, steepest] >= _LEAST_FALL)
     good &= (steepest > 0) & (steepest < fall.shape[1] - 1)  # at an end it may lie beyond
     middle = (away[edge + 1] + away[last + 1]) / 2
-    return np.asarray(middle[good] - away[steepest[good] + _WIDE])
+    gap = middle[good] - away[steepest[good] + _WIDE]
+    return np.column_stack([gap, direction[good]])

@@ -13,7 +13,7 @@ from mushpipe import Camera, Circles, Header, Mask, RgbdFrame
 from mushpipe.evaluate.truth import read_truth
 from mushpipe.sources.mcap import McapSource
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_gap import edge_gaps
+from mushpipe.stages.cap_gap import edge_gaps, usual
 from mushpipe.stages.phase_hough import PhaseHough
 from tests.stages.frames import SIMULATED
 
@@ -25,17 +25,21 @@ def disc(x: float, y: float, radius: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("wider", [-2.0, 0.0, 1.0, 3.0])
-def test_the_gap_is_what_depth_is_wider_by(wider: float) -> None:
-    place = (161.3, 118.6)
-    luma = 40 + 170 * disc(*place, 40)
-    depth = np.where(disc(*place, 40 + wider) > 0.5, 0.47, 0.5).astype(np.float32)
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (3.0, -2.0)])
+def test_gaps_tell_what_depth_is_wider_by_and_where_it_lies(
+    wider: float, shift: tuple[float, float]
+) -> None:
+    x, y = 161.3, 118.6
+    luma = 40 + 170 * disc(x, y, 40)
+    near = disc(x + shift[0], y + shift[1], 40 + wider) > 0.5
     color = np.repeat(luma[..., None], 3, axis=2).astype(np.uint8)
-    frame = RgbdFrame(
-        Header(0, 0, "camera"), color, depth, 1.0, Camera(320, 240, 617, 617, 160, 120)
-    )
-    gaps = edge_gaps(frame, Circles(np.array([place]), np.array([40.4]), np.ones(1)))
+    depth = np.where(near, 0.47, 0.5).astype(np.float32)
+    camera = Camera(320, 240, 617, 617, 160, 120)
+    frame = RgbdFrame(Header(0, 0, "camera"), color, depth, 1.0, camera)
+    gaps = edge_gaps(frame, Circles(np.array([[x, y]]), np.array([40.4]), np.ones(1)))
     assert len(gaps) == 32
-    assert np.mean(gaps) == pytest.approx(wider, abs=0.3)  # pixels of depth are in or out
+    found = usual(gaps)
+    assert found == pytest.approx([wider, *shift], abs=0.35)  # pixels of depth are in or out
 
 
 def widened(frame: RgbdFrame, by: int) -> RgbdFrame:
@@ -49,15 +53,23 @@ def widened(frame: RgbdFrame, by: int) -> RgbdFrame:
     return replace(frame, depth=np.where(near < 65535, near, 0).astype(np.uint16))
 
 
-def told(stage: CapFit, by: int, caplog: pytest.LogCaptureFixture) -> tuple[list[str], float]:
-    """Return what `cap-fit` warns of on a recording so widened, and the diameters' bias, mm."""
+def told(
+    stage: CapFit, by: int, caplog: pytest.LogCaptureFixture, right: int = 0
+) -> tuple[list[str], float]:
+    """Return what `cap-fit` warns of on a recording so widened, and the diameters' bias, mm.
+
+    Depth may be moved to the right by some px, too.
+    """
     caplog.clear()
     detect, bias = PhaseHough(radius_px=(8, 80), min_score=0.5), []
     stage.open()
-    path = SIMULATED / "first-bed.mcap"
+    path = SIMULATED / "moving.mcap"
     known = read_truth(path)
     for frame in McapSource(path=path).frames():
-        seen, truth = widened(frame, by), known.frames[known.place(frame.header)].caps
+        seen = widened(frame, by)
+        assert seen.depth is not None
+        seen = replace(seen, depth=np.roll(seen.depth, right, axis=1))
+        truth = known.frames[known.place(frame.header)].caps
         circles = detect.process(seen, Mask(np.ones(seen.color.shape[:2], np.bool_)))
         sure = circles.take(circles.radius > 15)
         found, _, circles = stage.process(seen, sure)
@@ -65,7 +77,7 @@ def told(stage: CapFit, by: int, caplog: pytest.LogCaptureFixture) -> tuple[list
         near = (away.min(axis=1) < 3) & (truth.visible > 0.8)
         bias.extend((found.diameter[away.argmin(axis=1)] - truth.diameter)[near])
     said = [record.getMessage() for record in caplog.records]
-    return [text for text in said if "edge_offset_px" in text], 1e3 * float(np.nanmedian(bias))
+    return [text for text in said if text.startswith("cap-fit")], 1e3 * float(np.nanmedian(bias))
 
 
 def test_a_camera_that_shows_caps_wider_is_told_of_with_what_puts_it_right(
@@ -80,7 +92,7 @@ def test_a_camera_that_shows_caps_wider_is_told_of_with_what_puts_it_right(
     assert found is not None
     said, mended = told(CapFit(edge_offset_px=float(found[1])), 3, caplog)
     assert said == []
-    assert wide - right > 2
+    assert wide - right > 1.5
     assert abs(mended) < 0.6
 
 
@@ -89,3 +101,14 @@ def test_a_setting_for_another_camera_is_told_of(caplog: pytest.LogCaptureFixtur
     assert "edge_offset_px: -2.5 takes them for 2.5 px outside" in message
     assert "diameters are too small" in message
     assert bias < -0.5
+
+
+def test_depth_that_is_not_aligned_to_colour_is_told_of(caplog: pytest.LogCaptureFixture) -> None:
+    (message,), _ = told(CapFit(), 0, caplog, right=4)
+    found = re.search(r"depth shows caps ([\d.]+) px to the right and ([\d.]+) px", message)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(4, abs=0.5)
+    assert float(found[2]) < 0.5
+    assert "not aligned to colour" in message
+    (message,), _ = told(CapFit(), 0, caplog, right=-3)
+    assert "px to the left" in message
