@@ -48,9 +48,7 @@ def recording(folder: Path, **scene: int) -> Path:
 
 def measure(folder: Path, frames: int, **scene: int) -> dict[str, float]:
     """Return the median time of each stage on one frame of a scene, ms."""
-    largest = 45 * scene.get("width", 640) / 640
-    radii = f"detect.radius_px=[{max(5, largest / 6)},{largest}]"
-    return stage_times(GRAPH, recording(folder, **scene), frames, [radii])
+    return stage_times(GRAPH, recording(folder, **scene), frames)
 
 
 def stage_times(

@@ -17,10 +17,11 @@ from mushpipe import Circles, RgbdFrame
 
 logger = logging.getLogger("mushpipe")
 Floats = NDArray[np.float64]
-# Edges: enough to judge by, in so many frames at most, and how far from what was stated they may
+# Edges: enough to judge by, from so many frames at most, and how far from what was stated they may
 # lie, px. At two, diameters are 1.5 mm off, and axes by 2 degrees more.
 ENOUGH, PATIENCE, AMISS, SHIFTED = 100, 60, 1.5, 2.0
 _OUTLIER = 2.0  # px from what is usual
+_LEAST_SPREAD = 0.15  # least eigenvalue of the normal matrix; 0.5 where all sides are alike
 MOST, LEAST_RADIUS = 40, 14  # circles that are looked at: so many, of this radius, px, or more
 _DIRECTIONS, _STEP = 32, 0.5  # px between places along a direction
 _REACH, _SHARE = 8.0, 0.3  # looked at to both sides of a circle: px, or share of its radius
@@ -34,6 +35,7 @@ class EdgeWatch:
 
     def __init__(self) -> None:
         self._gaps: list[Floats] | None = []  # None once they were judged
+        self._seen = np.zeros((0, 2))  # centres of the circles that were looked at, px
 
     def look(self, frame: RgbdFrame, circles: Circles, edge_offset_px: float) -> None:
         """Look at a frame; warn, once, where depth shows caps otherwise than colour.
@@ -45,14 +47,17 @@ class EdgeWatch:
         """
         if self._gaps is None:
             return
-        self._gaps.append(edge_gaps(frame, circles))
+        # Where nothing moves, the same edges again would say nothing new.
+        away = np.linalg.norm(circles.center[:, None] - self._seen, axis=2)
+        new = circles.take((away > circles.radius[:, None]).all(axis=1))
+        self._seen = np.concatenate([self._seen, new.center])
+        self._gaps.append(edge_gaps(frame, new))
         gaps = np.concatenate(self._gaps)
-        if len(gaps) < ENOUGH and len(self._gaps) < PATIENCE:
-            return
-        self._gaps = None
-        if len(gaps) >= ENOUGH:
-            wider, *shift = usual(gaps)
-            _tell(-wider, edge_offset_px, (shift[0], shift[1]))
+        found = usual(gaps) if len(gaps) >= ENOUGH else None
+        if found is not None:
+            _tell(-found[0], edge_offset_px, (found[1], found[2]))
+        if found is not None or len(self._gaps) == PATIENCE:
+            self._gaps = None
 
 
 def _tell(lost: float, stated: float, shift: tuple[float, float]) -> None:
@@ -77,13 +82,18 @@ def _tell(lost: float, stated: float, shift: tuple[float, float]) -> None:
         )
 
 
-def usual(gaps: Floats) -> Floats:
+def usual(gaps: Floats) -> Floats | None:
     """Return by how much depth shows caps wider than colour (3,), px, and shifted along x and y.
 
     Args:
         gaps: (K, 3) from `edge_gaps`.
+
+    Returns:
+        None where the edges lie on so few sides that the three cannot be told apart.
     """
     basis = np.column_stack([np.ones(len(gaps)), gaps[:, 1:]])
+    if np.linalg.eigvalsh(basis.T @ basis / len(gaps))[0] < _LEAST_SPREAD:
+        return None
     found = np.array([np.median(gaps[:, 0]), 0.0, 0.0])
     for reach in (4 * _OUTLIER, 2 * _OUTLIER, _OUTLIER, _OUTLIER):
         near = np.abs(gaps[:, 0] - basis @ found) <= reach

@@ -13,7 +13,7 @@ from mushpipe import Camera, Circles, Header, Mask, RgbdFrame
 from mushpipe.evaluate.truth import read_truth
 from mushpipe.sources.mcap import McapSource
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_gap import edge_gaps, usual
+from mushpipe.stages.cap_gap import EdgeWatch, edge_gaps, usual
 from mushpipe.stages.phase_hough import PhaseHough
 from tests.stages.frames import SIMULATED
 
@@ -104,11 +104,26 @@ def test_a_setting_for_another_camera_is_told_of(caplog: pytest.LogCaptureFixtur
 
 
 def test_depth_that_is_not_aligned_to_colour_is_told_of(caplog: pytest.LogCaptureFixture) -> None:
-    (message,), _ = told(CapFit(), 0, caplog, right=4)
+    (message,), _ = told(CapFit(), 1, caplog, right=4)
     found = re.search(r"depth shows caps ([\d.]+) px to the right and ([\d.]+) px", message)
     assert found is not None
-    assert float(found[1]) == pytest.approx(4, abs=0.5)
+    assert float(found[1]) == pytest.approx(4, abs=0.7)
     assert float(found[2]) < 0.5
     assert "not aligned to colour" in message
-    (message,), _ = told(CapFit(), 0, caplog, right=-3)
+    (message,), _ = told(CapFit(), 1, caplog, right=-3)
     assert "px to the left" in message
+
+
+def test_edges_that_do_not_move_or_lie_on_one_side_are_no_evidence(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    frame = widened(next(iter(McapSource(path=SIMULATED / "lab.mcap").frames())), 3)
+    some = PhaseHough(radius_px=(8, 80), min_score=0.5).process(
+        frame, Mask(np.ones(frame.color.shape[:2], np.bool_))
+    )
+    watch = EdgeWatch()
+    for _ in range(20):
+        watch.look(frame, some.take(np.arange(3)), 0.7)
+    assert caplog.messages == []
+    side = np.random.default_rng(4).uniform(-0.7, 0.7, 500)
+    assert usual(np.column_stack([side, np.cos(side), np.sin(side)])) is None
