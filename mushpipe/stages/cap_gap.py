@@ -134,6 +134,8 @@ def _gaps(
     x, y = x.astype(np.float32), y.astype(np.float32)
     height, width = gray.shape
     inside = ((x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)).all(axis=1)
+    if not inside.any():
+        return np.zeros((0, 3))
     luma = cv2.remap(gray, x[inside], y[inside], cv2.INTER_LINEAR)
     z = cv2.remap(depth, x[inside], y[inside], cv2.INTER_NEAREST)
     known = (z > 0).all(axis=1)
