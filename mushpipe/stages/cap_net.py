@@ -25,7 +25,7 @@ from mushpipe.stages.cap_decode import (
     circles_of,
     first_of_each,
 )
-from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE
+from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE, discs_of
 from mushpipe.stages.letterbox import resized
 
 FILE = "cap_net.onnx"
@@ -37,6 +37,7 @@ _LARGEST_SCALE = 4.0
 _LEAST_KNOWN = 0.35  # share of the pixels with depth from which on depth tells enough
 # Depth shrinks the image in such steps: every size of it has a session of its own.
 _STEP, _LEAST_SCALE = 0.8, 0.2
+_CLEARLY = 1.25  # so much more of the image circles at another scale must explain
 
 
 Positive = Annotated[float, Field(gt=0)]
@@ -52,7 +53,8 @@ class CapNet(Stage):
     radius_px: tuple[Positive, Positive | None] = Field(
         (8, 45),
         description="smallest and largest radius, px; circles may be a tenth beyond; the image is "
-        "scaled to suit. [8, null]: 60 px, or what largest_mm is at the depth that is seen",
+        "scaled to suit. [8, null]: what largest_mm is at the depth that is seen, 60 px or more; "
+        "without depth the scale is halved while circles explain more of the image so",
     )
     largest_mm: float = Field(
         90, ge=1, description="largest diameter, mm, where radius_px leaves it to depth"
@@ -112,10 +114,36 @@ class CapNet(Stage):
         Raises:
             UsageError: The model's output has not the shape of `cap-net`.
         """
-        height, width = frame.color.shape[:2]
         scale, largest = self.scaling(frame)
+        mask, found = self._look(frame.color, scale, largest or _KNOWN[1])
+        further = largest is None
+        while further and scale / 2 >= _LEAST_SCALE:
+            # Nothing tells how large caps are, but that more is explained at the scale they are of.
+            scale /= 2
+            other = self._look(frame.color, scale, _KNOWN[1] / scale)
+            if further := _explained(other[1]) > _CLEARLY * _explained(found):
+                mask = Mask(mask.foreground | other[0].foreground)
+                found = self._together(found, other[1])
+        return mask, found
+
+    def _together(self, fine: Circles, coarse: Circles) -> Circles:
+        """Return the circles of two scales; of a fine one within a surer coarse one nothing."""
+        away = np.linalg.norm(fine.center[:, None] - coarse.center, axis=2)
+        within = (away < coarse.radius) & (fine.score[:, None] <= coarse.score)
+        parts = (coarse, fine.take(~within.any(axis=1)))
+        center, radius, score = (
+            np.concatenate([getattr(part, name) for part in parts])
+            for name in ("center", "radius", "score")
+        )
+        first = np.argsort(-score, kind="stable")
+        every = Circles(center[first], radius[first], score[first])
+        return every.take(first_of_each(discs_of(every), self.overlap))
+
+    def _look(self, color: NDArray[np.uint8], scale: float, largest: float) -> tuple[Mask, Circles]:
+        """Return what is found in an image at a scale, up to a radius, px of the image."""
+        height, width = color.shape[:2]
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
-        maps = self._maps(frame.color if scale == 1 else resized(frame.color, size))
+        maps = self._maps(color if scale == 1 else resized(color, size))
         # pixel x of the frame lies at ratio (x + 1/2) - 1/2 of the scaled image
         ratio = np.array([width / size[0], height / size[1]])
         circles, score = circles_of(maps, self.min_score)
@@ -130,10 +158,11 @@ class CapNet(Stage):
         found = Circles(circles[keep, :2], circles[keep, 2], score[keep])
         return Mask(cap[:height, :width] > 0), found
 
-    def scaling(self, frame: RgbdFrame) -> tuple[float, float]:
+    def scaling(self, frame: RgbdFrame) -> tuple[float, float | None]:
         """Return by how much a frame's image is scaled, and the largest radius, px of the frame.
 
-        The scale brings the radii to those that the network knows.
+        The scale brings the radii to those that the network knows. Where neither setting nor depth
+        tells the radius it is None, and the scale that for the known ones.
         """
         depth = _depth_seen(frame)
         smallest, largest = self.radius_px
@@ -142,7 +171,7 @@ class CapNet(Stage):
         if largest is not None:
             return scale, largest
         if depth is None or frame.camera is None:
-            return scale, _KNOWN[1]
+            return scale, None
         largest = max(_KNOWN[1], self.largest_mm / 2000 * frame.camera.fx / depth)
         # Of small caps the network sees less then; a detector that uses depth finds those itself.
         while scale * largest > _KNOWN[1] and scale > _LEAST_SCALE:
@@ -184,6 +213,11 @@ def _scale_for(smallest: float, largest: float) -> float:
     if least > most:
         return float(np.sqrt(least * most))
     return float(np.clip(1.0, least, most))
+
+
+def _explained(circles: Circles) -> float:
+    """Return how much of an image circles explain: their squared radii, as far as they are sure."""
+    return float((circles.score * circles.radius**2).sum())
 
 
 def _depth_seen(frame: RgbdFrame) -> float | None:

@@ -30,6 +30,7 @@ from mushpipe.stages.phase_learned import (
     add_discs,
     agreement,
     candidates_of,
+    largest_of,
     with_bare,
     within,
     without_clods,
@@ -102,8 +103,8 @@ class PhaseHough(Stage):
     radius_px: tuple[Positive, Positive | None] | None = Field(
         (8.0, 38.0),
         description="smallest and largest radius looked for, px; outlines may be fitted a tenth "
-        "beyond; null takes them from diameter_mm and depth. [8, null]: 80 px, or more where depth "
-        "says that a cap of diameter_mm is larger",
+        "beyond; null takes them from diameter_mm and depth. [8, null]: 80 px, or more where a cap "
+        "of diameter_mm is larger at the depth that is seen, or one that is learned",
     )
     diameter_mm: tuple[Positive, Positive] = Field(
         (6.0, 120.0), description="smallest and largest diameter, mm, where there is depth"
@@ -190,10 +191,10 @@ class PhaseHough(Stage):
             return None
         literal = self.input == "mask"
         relief = relief_of(frame) if self.use_depth and not literal else None
-        smallest, largest = self._range(relief, height, width)
+        smallest, largest = self._range(relief, learned, height, width)
         if smallest >= largest:
             return None
-        image = _levels(frame, mask, literal)
+        image = np.asarray(mask.foreground if literal else frame.gray, np.float32) * np.float32(255)
         gradient = gradient_of(image)
         inside = mask.foreground.view(np.uint8)
         if learned is not None:
@@ -238,11 +239,14 @@ class PhaseHough(Stage):
             self._models = load_verifier(self.verifier, self.input == "mask")
         return self._models
 
-    def _range(self, relief: Relief | None, height: int, width: int) -> tuple[float, float]:
-        """Return the smallest and largest radius, px, no larger than the image."""
+    def _range(
+        self, relief: Relief | None, learned: Circles | None, height: int, width: int
+    ) -> tuple[float, float]:
+        """Return smallest and largest radius, px, no larger than the image."""
         smallest, largest = self.radius_px or (8.0, 38.0)
         if largest is None:
-            largest = max(_LARGE, self.diameter_mm[1] / 2000 / relief.pixel if relief else 0)
+            by_depth = self.diameter_mm[1] / 2000 / relief.pixel if relief else 0
+            largest = max(_LARGE, by_depth, largest_of(learned, _LIKELY))
         if self.radius_px is None and relief is not None:
             # a cap is nearer than the bed, hence larger in the image
             near = relief.bed_pixel(*np.array([(0, width, 0, width), (0, 0, height, height)]))
@@ -283,12 +287,6 @@ class PhaseHough(Stage):
 def equal_area_radius(shapes: Table) -> Table:
     """Return the radii (N,) of the circles with the area of the outlines (N, 5)."""
     return np.asarray(np.sqrt(shapes[:, 2] ** 2 + (shapes[:, 3] ** 2 + shapes[:, 4] ** 2) / 2))
-
-
-def _levels(frame: RgbdFrame, mask: Mask, literal: bool) -> Plane:
-    """Return what edges are taken from, (H, W) in 0..255."""
-    image = mask.foreground if literal else frame.gray
-    return np.asarray(image, np.float32) * np.float32(255)
 
 
 def _foreground(inside: Bytes, relief: Relief | None) -> Bytes:

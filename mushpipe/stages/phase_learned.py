@@ -28,6 +28,13 @@ def within(learned: Circles, smallest: float, largest: float) -> Circles:
     return learned.take(enough & (learned.radius <= MOST_OF_RANGE * largest))
 
 
+def largest_of(learned: Circles | None, least: float) -> float:
+    """Return the largest radius, px, and a tenth, of circles of such a score; 0 without any."""
+    if learned is None:
+        return 0.0
+    return float(MOST_OF_RANGE * learned.radius[learned.score >= least].max(initial=0.0))
+
+
 def candidates_of(learned: Circles) -> Plane:
     """Return circles as candidates (N, 4) for a refit."""
     return np.column_stack([learned.center, learned.radius, learned.score]).astype(np.float32)

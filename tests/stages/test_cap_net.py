@@ -96,8 +96,8 @@ def test_depth_tells_how_large_caps_are_in_the_image(
         assert found * radius <= 60
     else:
         assert found >= 0.16  # whatever the depth: a smaller image shows no cap
-    assert stage.scaling(replace(near, camera=None)) == (0.8, 60)
-    assert stage.scaling(replace(near, depth=None)) == (1, 60)
+    assert stage.scaling(replace(near, camera=None)) == (0.8, None)
+    assert stage.scaling(replace(near, depth=None)) == (1, None)
 
 
 def test_beside_depth_the_image_is_scaled_and_the_answer_scaled_back() -> None:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
+from mushpipe import RgbdFrame
 from mushpipe.core.truth import INSTANCES_TOPIC, TRUTH_TOPIC
 from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.cap_net import CapNet
 from mushpipe.stages.phase_hough import PhaseHough
-from tests.stages.frames import simulated
+from tests.stages.frames import first, simulated
 from training.matching import Score, counted
 from training.net.scenes import cap_mask
 
@@ -37,23 +39,44 @@ def test_more_brown_caps_among_rubble_are_found_than_by_the_net_alone_and_refitt
     assert away < 0.7 * before
 
 
-def test_caps_near_the_camera_are_found_where_the_largest_radius_is_left_to_depth() -> None:
+@pytest.mark.parametrize("depth", [True, False])
+def test_caps_near_the_camera_are_found_where_the_largest_radius_is_left_open(depth: bool) -> None:
     found = {}
-    for name, net, detector in (("fixed", 60, 80), ("by depth", None, None)):
+    for name, net, detector in (("fixed", 60, 80), ("open", None, None)):
         detect = PhaseHough(radius_px=(8, detector), min_score=0.2, use_learned=True)
         stage = CapNet(radius_px=(8, net), min_score=0.05, beside_depth=0.8)
         score = Score()
         for seed, color in ((91, "brown"), (92, "white"), (93, "brown")):
             near = {"distance": 0.25, "size_mm": (45, 75), "count": 12, "cap_color": color}
             frame = simulated(seed, width=640, height=480, shape_family="b", **near)
+            seen = frame if depth else replace(frame, depth=None)
+            circles = detect.process(seen, *stage.process(seen))
+            _, _, circles = CapFit(min_score=0.5).process(seen, circles)
             truth = frame.attached[TRUTH_TOPIC]
-            _, _, circles = CapFit(min_score=0.5).process(
-                frame, detect.process(frame, *stage.process(frame))
-            )
             score.add(circles, truth, counted(truth, 60, 200))
         found[name] = score
-    assert found["by depth"].recall > 0.9
-    assert found["by depth"].recall > found["fixed"].recall + 0.2
+    assert found["open"].recall > 0.9
+    assert found["open"].recall > found["fixed"].recall + 0.2
+
+
+def test_small_caps_are_seen_at_the_scale_of_large_ones_too() -> None:
+    frame = replace(first("first-bed"), depth=None)
+    _, alone = CapNet(radius_px=(8, 60)).process(frame)
+    _, same = CapNet(radius_px=(8, None)).process(frame)
+    assert np.array_equal(same.center, alone.center)
+    # the same bed beside itself, three times as large: no scale is right for both
+    color = frame.color
+    large = cv2.resize(color, None, fx=3, fy=3, interpolation=cv2.INTER_CUBIC)
+    canvas = np.zeros((large.shape[0], large.shape[1] + color.shape[1], 3), np.uint8)
+    canvas[:, : large.shape[1]] = large
+    canvas[: color.shape[0], large.shape[1] :] = color
+    _, both = CapNet(radius_px=(8, None)).process(RgbdFrame(frame.header, canvas))
+    sure = alone.take(alone.score > 0.8)
+    for scale, shift in ((3, 0), (1, large.shape[1])):
+        center = scale * (sure.center + 0.5) - 0.5 + [shift, 0]
+        away = np.linalg.norm(center[:, None] - both.center, axis=2)
+        near = away.min(axis=1) < 0.3 * scale * sure.radius
+        assert near.mean() > 0.85
 
 
 @pytest.mark.parametrize("learned", [False, True])
