@@ -42,8 +42,8 @@ class OnnxFile:
         if not path.is_file():
             raise UsageError(f"model {path}: there is no such file")
         self.path = path
-        # Two sizes at least: frames with and without depth may differ in theirs.
-        self._session = lru_cache(maxsize=3)(self._opened)
+        # Frames with and without depth may differ in their sizes, and be looked at in several.
+        self._session = lru_cache(maxsize=6)(self._opened)
         session = self._session(())
         self.inputs = _shapes(session.get_inputs())
         self.outputs = _shapes(session.get_outputs())

@@ -47,7 +47,8 @@ class CapNet(Stage):
     """Detects caps in colour with a network of 161 000 parameters, trained on simulated beds.
 
     Heat map, radius, offset and mask at a quarter of the resolution (after CenterNet, Zhou et al.
-    2019, arXiv 1904.07850). The score is the height of a circle's peak. Depth is not looked at.
+    2019, arXiv 1904.07850). The score is the height of a circle's peak. Depth tells at most how
+    large caps can be in the image.
     """
 
     radius_px: tuple[Positive, Positive | None] = Field(
