@@ -143,6 +143,9 @@ def _decode_compressed_depth(message: Any, scale: float | None) -> tuple[NDArray
     return metres, _known_scale(scale, 1.0, "32FC1")
 
 
+_LENGTHS = (4, 5, 8, 12, 14)  # of coefficients that OpenCV has
+
+
 def distortion(message: Any) -> list[float]:
     """Return the distortion that a CameraInfo or CameraCalibration states."""
     return [float(v) for v in (message.d if hasattr(message, "d") else message.D)]
@@ -170,11 +173,14 @@ def decode_camera(message: Any, rectified: bool = False) -> Camera | None:
     coefficients: tuple[float, ...] = ()
     if any(d) or (message.distortion_model in _FISHEYE and not rectified):
         names = {wire: own for own, wire in DISTORTION_MODELS.items()}
-        model, coefficients = names.get(message.distortion_model, "unknown"), tuple(d)
-        if COEFFICIENTS.get(model) != len(d):
+        model = names.get(message.distortion_model, "unknown")
+        count = COEFFICIENTS.get(model, 0)
+        # OpenCV's order: those left out at the end are 0, those beyond (thin prism, tilt) must be.
+        if not count or len(d) not in _LENGTHS or any(d[count:]):
             raise ValueError(
                 f"distortion model '{message.distortion_model}' with {len(d)} coefficients is not "
-                "supported (supported: plumb_bob with 5, rational_polynomial with 8); "
-                "rectify the images"
+                "supported (supported: plumb_bob with 4 or 5, rational_polynomial with 8, and "
+                "zeros behind); rectify the images"
             )
+        coefficients = (*d[:count], *[0.0] * (count - len(d)))
     return Camera(message.width, message.height, k[0], k[4], k[2], k[5], model, coefficients)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
 from mushpipe.core.errors import InputError
@@ -99,6 +101,21 @@ def test_distortion_is_kept(tmp_path: Path, wire: str, model: str, count: int) -
     assert cameras(tmp_path, [info_at(0, d=d, model=wire), *COLORS]) == [expected] * 3
 
 
+@pytest.mark.parametrize("length", [4, 5, 8, 12, 14])
+@pytest.mark.parametrize(("model", "known"), [("plumb_bob", 5), ("rational_polynomial", 8)])
+def test_coefficients_left_out_or_of_zero_are_as_opencv_has_them(
+    tmp_path: Path, model: str, known: int, length: int
+) -> None:
+    values = np.array([0.1, -0.2, 0.01, 0.02, 0.05, 0.03, 0.02, 0.01, *[0.0] * 6])
+    values[known:] = 0
+    (camera, *_) = cameras(tmp_path, [info_at(0, d=tuple(values[:length]), model=model), *COLORS])
+    points = np.random.default_rng(1).uniform((-0.2, -0.2, 0.9), (0.2, 0.2, 1.1), (20, 3))
+    matrix = np.array([[FX, 0, CX], [0, FY, CY], [0, 0, 1]])
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, values[:length])
+    assert camera is not None
+    assert camera.project(points) == pytest.approx(expected[:, 0], abs=1e-9)
+
+
 @pytest.mark.parametrize("model", ["plumb_bob", "rational_polynomial", ""])
 def test_distortion_of_zeros_is_none(model: str, tmp_path: Path) -> None:
     assert cameras(tmp_path, [info_at(0, model=model), *COLORS]) == [CALIBRATED] * 3
@@ -111,6 +128,8 @@ def test_distortion_of_zeros_is_none(model: str, tmp_path: Path) -> None:
         ("equidistant", (0.0,) * 4),  # r = f theta, not f tan(theta): no pinhole
         ("kannala_brandt", ()),
         ("rational_polynomial", (0.1,) * 14),
+        ("plumb_bob", (0.1,) * 8),
+        ("plumb_bob", (0.1, 0.2)),
     ],
 )
 def test_an_unsupported_lens_model_is_reported_after_the_frames(
