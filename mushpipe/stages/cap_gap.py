@@ -115,12 +115,14 @@ def edge_gaps(frame: RgbdFrame, circles: Circles) -> Floats:
         raise ValueError("a frame without calibration")
     large = np.argsort(-circles.radius, kind="stable")[:MOST]
     large = large[circles.radius[large] >= LEAST_RADIUS]
+    if not len(large):
+        return np.zeros((0, 3))
     depth = np.nan_to_num(frame.depth_m)
     found = [
         _gaps(frame.gray, depth, frame.camera.fx, circles.center[k], float(circles.radius[k]))
         for k in large
     ]
-    return np.concatenate([np.zeros((0, 3)), *found])
+    return np.concatenate(found)
 
 
 def _gaps(
