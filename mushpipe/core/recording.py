@@ -44,13 +44,14 @@ SUMMARY = "mushpipe.summary"
 GRAPH = "mushpipe.graph"
 
 
+ZSTD = b"\x28\xb5\x2f\xfd"  # what Zstandard's frames begin with
 CONVERT = "'rosbags-convert --src {} --dst NEW_FOLDER --dst-storage mcap'"
 # What other recordings begin with: what they are, and what makes them readable.
 _OTHERS = {
     b"SQLite f": f"a ROS 2 bag in SQLite: {CONVERT.format('ITS_FOLDER')} makes MCAP of it",
     b"#ROSBAG ": f"a bag of ROS 1: {CONVERT.format('FILE')} makes MCAP of it; one of Intel's "
     "viewer is played where its name ends with .bag",
-    b"\x28\xb5\x2f\xfd": "compressed as a whole: 'zstd -d FILE' unpacks it",
+    ZSTD: "compressed as a whole: 'zstd -d FILE' unpacks it",
 }
 
 

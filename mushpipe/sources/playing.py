@@ -17,7 +17,7 @@ from mcap_ros2.decoder import DecoderFactory as Ros2Decoders
 from mushpipe.core import wire
 from mushpipe.core.errors import InputError
 from mushpipe.core.geometry import Camera
-from mushpipe.core.recording import CONVERT, Raw
+from mushpipe.core.recording import CONVERT, ZSTD, Raw
 from mushpipe.core.types import Header, RgbdFrame
 from mushpipe.sources.doubts import warned
 from mushpipe.sources.images import decode_camera, decode_color, decode_depth, distortion
@@ -28,7 +28,6 @@ from mushpipe.sources.topics import Topics, is_beside, says_aligned
 T = TypeVar("T")
 logger = logging.getLogger("mushpipe")
 MOST_BESIDE = 256  # frames of which something waits that was recorded beside them
-_ZSTD = b"\x28\xb5\x2f\xfd"
 _COMPRESSED = (
     "each message is compressed (ros2 bag record --compression-mode message): "
     f"{CONVERT.format('ITS_FOLDER')} unpacks them"
@@ -178,7 +177,7 @@ class Player:
     ) -> T | None:
         """Decode a message, or return None and count it where ``what`` says as what."""
         try:
-            if raw.message.data.startswith(_ZSTD):  # no message begins so, CDR begins with 0
+            if raw.message.data.startswith(ZSTD):  # no message begins so, CDR begins with 0
                 raise ValueError(_COMPRESSED)
             schema = _with_ros2_names(raw.schema)
             for factory in self._factories:
