@@ -49,6 +49,7 @@ def bench(plan_of: Callable[[int], Plan], frames: int) -> dict[str, Any]:
     return {
         **conditions(plan_of(frames)),
         "frames": report.processed,
+        "failed": report.failed,
         "frames_per_s": round(report.processed / elapsed, 2),
         "cpu_ms_per_frame": round(1e3 * cpu / report.processed, 2),
         "cores_busy": round(cpu / elapsed, 2),

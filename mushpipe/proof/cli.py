@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from mushpipe.proof.compare import Comparison, Difference
 
 _FIGURES = (
-    *("frames", "frames_per_s", "cpu_ms_per_frame", "cores_busy"),
+    *("frames", "failed", "frames_per_s", "cpu_ms_per_frame", "cores_busy"),
     *("allocated_mb_per_frame", "peak_memory_mb", "memory_growth_mb"),
 )
 
@@ -117,6 +117,10 @@ def bench(
     with TemporaryDirectory(prefix="mushpipe-bench-") as folder:
         plan = plan.into(Path(folder))  # results of a run stay as they are
         result = measure(lambda count: _endless(plan, count, speed), frames)
+    if result["failed"]:
+        logging.getLogger("mushpipe").warning(
+            f"{result['failed']} frames failed: times are also of what was done of these"
+        )
     ratios = slower(result, before) if before else {}
     _show(result, ratios)
     if out is not None:
