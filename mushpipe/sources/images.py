@@ -160,7 +160,8 @@ def decode_camera(message: Any, rectified: bool = False) -> Camera | None:
             for them then, not K and D.
 
     Raises:
-        ValueError: The distortion model is one that is not implemented, or a number is not finite.
+        ValueError: The distortion model is one that is not implemented, a number is not finite, or
+            the calibration says not for which size of image it is.
     """
     k = list(message.k if hasattr(message, "k") else message.K)
     d = distortion(message)
@@ -169,6 +170,11 @@ def decode_camera(message: Any, rectified: bool = False) -> Camera | None:
         k = [*p[:3], *p[4:7], *p[8:11]] if len(p) == 12 and p[0] > 0 else k
     if len(k) != 9 or not (k[0] > 0 and k[4] > 0):
         return None
+    if not (message.width and message.height):
+        raise ValueError(
+            f"a calibration for images of {message.width}x{message.height} px: give source.camera: "
+            "{fx: , fy: , cx: , cy: }"
+        )
     model: str = "none"
     coefficients: tuple[float, ...] = ()
     if any(d) or (message.distortion_model in _FISHEYE and not rectified):

@@ -144,6 +144,14 @@ def test_an_unsupported_lens_model_is_reported_after_the_frames(
     assert source.counts() == {"calibrations that could not be decoded": 1}
 
 
+def test_a_calibration_without_a_size_of_image_is_refused(tmp_path: Path) -> None:
+    source = McapSource(path=write_bag(tmp_path, [info_at(0, size=(0, 0)), *COLORS]))
+    with pytest.raises(
+        InputError, match=r"info.*: a calibration for images of 0x0 px: give source"
+    ):
+        list(source.frames())
+
+
 def test_a_calibration_that_changes_is_followed(tmp_path: Path) -> None:
     entries = [info_at(0), color_at(0), info_at(1, k=(99, 0, 1, 0, 99, 1, 0, 0, 1)), color_at(1)]
     found = cameras(tmp_path, entries)
