@@ -21,19 +21,21 @@ from training.field import RANGES, labelled_frames, result
 from training.matching import Score, counted
 from training.net.scenes import CHOOSING_SEED, JUDGING_SEED, varied_cases
 from training.scenes import Case, choosing_cases, judging_cases
-from training.verifier import NET, RADII, segmentations
+from training.verifier import RADII, segmentations
 
+OPEN = (8.0, None)  # as graphs/pick.yaml has it: the largest radius is left to what is seen
+NET = CapNet(radius_px=OPEN, min_score=0.05, beside_depth=0.8)
 CLASSIC = {
     "image": PhaseHough(radius_px=RADII, use_depth=False),
     "depth": PhaseHough(radius_px=RADII),
-    "image+net": PhaseHough(radius_px=RADII, use_depth=False, use_learned=True),
-    "depth+net": PhaseHough(radius_px=RADII, use_learned=True),
+    "image+net": PhaseHough(radius_px=OPEN, use_depth=False, use_learned=True),
+    "depth+net": PhaseHough(radius_px=OPEN, use_learned=True),
 }
 FITTED = {  # down to a low score, for `cap-fit` to decide; at last without depth
     "fitted": PhaseHough(radius_px=RADII, min_score=judge.LEAST),
-    "fitted+net": PhaseHough(radius_px=RADII, min_score=judge.LEAST, use_learned=True),
+    "fitted+net": PhaseHough(radius_px=OPEN, min_score=judge.LEAST, use_learned=True),
     "seen+net": PhaseHough(
-        radius_px=RADII, min_score=judge.LEAST, use_depth=False, use_learned=True
+        radius_px=OPEN, min_score=judge.LEAST, use_depth=False, use_learned=True
     ),
 }
 
@@ -68,9 +70,9 @@ def simulated(models: list[Path], cases: Iterator[Case], peers: bool) -> str:
 
 def both(frame: RgbdFrame, depth: bool, beside_depth: float = 0.8) -> Circles:
     """Return the circles of network and classic detector, as graphs/pick.yaml has them."""
-    net = CapNet(radius_px=(8, None), min_score=0.05, beside_depth=beside_depth)
+    net = CapNet(radius_px=OPEN, min_score=0.05, beside_depth=beside_depth)
     frame = frame if depth else replace(frame, depth=None)
-    stage = PhaseHough(radius_px=(8, None), min_score=judge.LEAST, use_learned=True)
+    stage = PhaseHough(radius_px=OPEN, min_score=judge.LEAST, use_learned=True)
     return judge.kept(frame, stage.process(frame, *net.process(frame)))
 
 
