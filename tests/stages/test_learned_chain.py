@@ -98,8 +98,8 @@ def test_what_is_hardly_a_cap_changes_nothing_about_those_that_are_likely(learne
     assert below > 0
 
 
-def test_grainy_caps_that_the_net_doubts_are_found_without_depth() -> None:
-    """The simulator's caps are smooth, and the net takes grainy ones for stumps."""
+def test_grainy_caps_are_found_without_depth() -> None:
+    """The simulator's caps are smooth; a net that saw no others takes grainy ones for stumps."""
     alone, both = Score(), Score()
     for seed in (91, 92, 93):
         frame = simulated(seed, width=640, height=480, shape_family="b", count=40, stumps=4)
@@ -112,5 +112,6 @@ def test_grainy_caps_that_the_net_doubts_are_found_without_depth() -> None:
         circles = PhaseHough(radius_px=RADII, use_learned=True).process(frame, mask, learned)
         alone.add(CapNet(radius_px=RADII).process(frame)[1], truth, counted(truth, *RADII))
         both.add(circles, truth, counted(truth, *RADII))
-    assert both.recall > max(0.7, alone.recall + 0.2)
-    assert both.precision > 0.9
+    assert alone.recall > 0.85
+    assert both.recall > max(0.95, alone.recall)
+    assert min(alone.precision, both.precision) > 0.9

@@ -9,6 +9,7 @@ from mushpipe.core.truth import Ignore
 from mushpipe.stages.cap_decode import HEAT, MASK, circles_of
 from training.net.augment import aims, blackened, blotched, crop, overexposed
 from training.net.scenes import Picture, settings
+from training.net.texture import grained, individual, shadowed, smooth_bed
 
 DISCS = [(150.0, 120.0, 30.0), (300.5, 200.25, 18.0), (420.0, 330.0, 41.0)]
 
@@ -89,6 +90,51 @@ def test_blotches_stay_within_what_they_are_laid_on(seed: int) -> None:
     assert (blotchy[cap == 0] == 0.5).all()
     assert blotchy[cap > 0].std(axis=0).max() > 0.01
     assert (blotchy > 0).all()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_grain_stays_on_caps_and_smoothing_on_the_bed(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    shape = ((64, 64), (48, 64), (64, 48))[seed % 3]
+    image = np.where(np.indices(shape).sum(axis=0) % 2, 0.1, 0.3)[..., None].repeat(3, axis=2)
+    image, cap = image.astype(np.float32), np.zeros(shape, np.float32)
+    image[16:40, 16:40], cap[16:40, 16:40] = 0.8, 1
+    grainy, smooth = grained(image, cap, rng), smooth_bed(image, cap, 2.0)
+    assert (grainy[cap == 0] == image[cap == 0]).all()
+    assert grainy[cap > 0].std(axis=0).min() > 0.003
+    assert grainy[cap > 0].mean() == pytest.approx(0.8, abs=0.05)
+    assert smooth[cap > 0] == pytest.approx(image[cap > 0])
+    # no brightness of the cap leaks into the bed beside it
+    assert smooth[cap == 0] == pytest.approx(0.2, abs=0.04)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_shadow_lies_on_one_side_of_its_cap_and_lamps_brighten_nothing(seed: int) -> None:
+    image = np.full((160, 160, 3), 0.5, np.float32)
+    rng = np.random.default_rng(seed)
+    circles = np.array([[80.0, 80.0, 20.0]] * 6)  # each casts one in four of five cases
+    dark = 0.5 - shadowed(image, circles, rng)[..., 0]
+    assert dark.min() >= 0
+    assert 0.1 <= dark.max() <= 0.4 + 1e-6
+    v, u = np.nonzero(dark > 0.05)
+    way = np.array([u.mean() - 79.5, v.mean() - 79.5])
+    assert np.hypot(*way) > 4
+    lit = np.array([80, 80]) - 17 * way / np.hypot(*way)
+    assert dark[round(lit[1]), round(lit[0])] < 0.05
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_each_cap_gets_one_gain_and_the_bed_none(seed: int) -> None:
+    image = np.full((120, 160, 3), 0.5, np.float32)
+    v, u = np.mgrid[:120, :160]
+    circles = np.array([[40.0, 60, 25], [110.0, 60, 30]])
+    discs = [np.hypot(u - x, v - y) < r - 1 for x, y, r in circles]
+    cap = np.any(discs, axis=0).astype(np.float32)
+    changed = individual(image, cap, circles, np.random.default_rng(seed))
+    assert (changed[cap == 0] == 0.5).all()
+    colors = [changed[disc] for disc in discs]
+    assert all(np.ptp(one, axis=0).max() < 1e-6 for one in colors)
+    assert np.abs(colors[0][0] - colors[1][0]).max() > 0.001
 
 
 @pytest.mark.parametrize("seed", range(6))

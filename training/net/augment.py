@@ -9,13 +9,10 @@ from numpy.typing import NDArray
 from mushpipe.core.truth import Ignore
 from mushpipe.stages.cap_decode import CHANNELS, HEAT, MASK, OFFSET, RADIUS, STRIDE
 from training.net.scenes import Picture
+from training.net.texture import NOISE, Floats, Singles, textured
 
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
 SMALLEST = 5.0  # px; smaller outlines are not asked for
 HIDDEN = 0.3  # nor are those of which less is seen
-# Noise is a stretch of this: to draw it anew took a sixth of a crop's time.
-_NOISE = np.random.default_rng(0).standard_normal(2_000_000, np.float32)
 
 
 def crop(
@@ -24,6 +21,7 @@ def crop(
     rng: np.random.Generator,
     near: float = 0.0,
     stained: bool = False,
+    surfaces: bool = False,
 ) -> tuple[Singles, Singles, Singles]:
     """Return an image (3, size, size) in 0..1, its target (5, h, w) and weight (h, w).
 
@@ -33,6 +31,7 @@ def crop(
         rng: Draws everything.
         near: Share of the crops that are taken around a cap; the others lie anywhere.
         stained: Whether caps and bed may be blotched, overexposed, and set one against the other.
+        surfaces: Whether they may have other surfaces, and caps shade each other.
     """
     matrix, scale = _placement(picture, size, rng, near)
     color = cv2.warpAffine(
@@ -41,9 +40,11 @@ def crop(
     )  # fmt: skip
     warped = cv2.warpAffine(picture.cap.astype(np.float32), matrix, (size, size))
     image, cap = np.asarray(color, np.float32) / np.float32(255), np.asarray(warped, np.float32)
-    image = photographed(image, cap, rng, stained)
     center = picture.circles[:, :2] @ matrix[:, :2].T + matrix[:, 2]
     circles = np.column_stack([center, picture.circles[:, 2] * scale])
+    if surfaces:
+        image = textured(image, cap, circles, rng)
+    image = photographed(image, cap, rng, stained)
     stump = picture.kind == Ignore.CUT_STUMP
     target, weight = aims(circles[~stump], (picture.visible < HIDDEN)[~stump], size // STRIDE)
     target[MASK] = cv2.resize(cap, None, fx=1 / STRIDE, fy=1 / STRIDE, interpolation=cv2.INTER_AREA)
@@ -123,8 +124,8 @@ def photographed(
     image = _patches(image, rng)
     if rng.random() < 0.4:
         image = cv2.GaussianBlur(image, (0, 0), rng.uniform(0.3, 1.5))
-    start = rng.integers(len(_NOISE) - image.size)
-    noise = _NOISE[start : start + image.size].reshape(image.shape)
+    start = rng.integers(len(NOISE) - image.size)
+    noise = NOISE[start : start + image.size].reshape(image.shape)
     image += noise * np.float32(rng.exponential(0.015))
     return np.asarray(np.clip(image, 0, 1), np.float32)
 

@@ -39,14 +39,14 @@ FITTED = {  # down to a low score, for `cap-fit` to decide; at last without dept
     ),
 }
 
-VARIED = 16  # frames, beside six of every other row
+EACH, VARIED = 3, 16  # frames of a row per shape family, and of `varied`
 
 
-def scenes(cache: Path, choosing: bool, varied: int = VARIED) -> Iterator[Case]:
-    """Yield the frames to judge on, with so many varied ones, or those for choices of design."""
+def scenes(cache: Path, choosing: bool, each: int = EACH, varied: int = VARIED) -> Iterator[Case]:
+    """Yield the frames to judge on, so many per row and family, or those for choices of design."""
     if choosing:
         return chain(choosing_cases(cache), varied_cases(cache, CHOOSING_SEED, "a", 60))
-    return chain(judging_cases(cache), varied_cases(cache, JUDGING_SEED, "b", varied))
+    return chain(judging_cases(cache, each), varied_cases(cache, JUDGING_SEED, "b", varied))
 
 
 def simulated(models: list[Path], cases: Iterator[Case], peers: bool) -> str:
@@ -97,6 +97,7 @@ def main() -> None:
     parser.add_argument("--models", type=Path, nargs="+", default=[shipped])
     parser.add_argument("--peers", action="store_true", help="the classic detector as well")
     parser.add_argument("--choosing", action="store_true", help="the frames for choices of design")
+    parser.add_argument("--each", type=int, default=EACH, help="frames of a row per shape family")
     parser.add_argument("--varied", type=int, default=VARIED, help="how many varied frames")
     parser.add_argument("--field", type=Path, help="labelled real recordings instead")
     arguments = parser.parse_args()
@@ -104,7 +105,7 @@ def main() -> None:
         for line in real(arguments.models[0], arguments.field):
             print(line)
     else:
-        cases = scenes(arguments.cache, arguments.choosing, arguments.varied)
+        cases = scenes(arguments.cache, arguments.choosing, arguments.each, arguments.varied)
         print(simulated(arguments.models, cases, arguments.peers))
 
 

@@ -3,11 +3,13 @@
 Strides 2 to 32: full convolutions down to stride 4, depthwise-separable residual blocks below, an
 additive top-down path (Lin et al. 2017, arXiv 1612.03144), one head at stride 4. Widths are whole
 multiples of 16, since ONNX Runtime computes as many channels at a time, and what follows a sum is
-one operation with it; both make the network a fifth faster.
+one operation with it; both make the network a fifth faster. The one that ships learnt from a large
+one of the same plan, with full convolutions throughout.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
@@ -16,9 +18,28 @@ from torch.nn import functional
 
 from mushpipe.stages.cap_decode import CHANNELS, HEAT, MASK, OFFSET, RADIUS
 
-WIDTHS = (32, 64, 96, 128)  # channels at strides 4, 8, 16, 32
 BLOCKS = (2, 3, 3)  # residual blocks at strides 8, 16, 32
-NECK = 32
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How large a network is.
+
+    Attributes:
+        widths: Channels at strides 4, 8, 16 and 32.
+        first: Channels at stride 2.
+        neck: Channels of the top-down path.
+        full: Whether convolutions are full 3x3 ones throughout.
+    """
+
+    widths: tuple[int, ...] = (32, 64, 96, 128)
+    first: int = 16
+    neck: int = 32
+    full: bool = False
+
+
+SMALL = Plan()  # 160 949 parameters
+LARGE = Plan((48, 96, 160, 224), first=32, neck=64, full=True)  # 5 323 333
 
 
 def normed(inputs: int, outputs: int, size: int, stride: int = 1, groups: int = 1) -> nn.Sequential:
@@ -38,12 +59,17 @@ def separable(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
     return nn.Sequential(*deep, *normed(inputs, outputs, 1))
 
 
-class Residual(nn.Module):
-    """ReLU(x + separable(x))."""
+def fully(width: int) -> nn.Sequential:
+    """Return two full 3x3 convolutions, each with batch norm."""
+    return nn.Sequential(convolution(width, width, 3), *normed(width, width, 3))
 
-    def __init__(self, width: int) -> None:
+
+class Residual(nn.Module):
+    """ReLU(x + separable(x)), or with two full convolutions."""
+
+    def __init__(self, width: int, full: bool) -> None:
         super().__init__()
-        self.body = separable(width, width)
+        self.body = fully(width) if full else separable(width, width)
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply it."""
@@ -53,24 +79,30 @@ class Residual(nn.Module):
 class CapNet(nn.Module):
     """RGB images (B, 3, H, W) in 0..1, H and W multiples of 32, to (B, 5, H/4, W/4)."""
 
-    def __init__(self) -> None:
+    def __init__(self, plan: Plan = SMALL) -> None:
         super().__init__()
-        first = WIDTHS[0]
+        widths, neck, full = plan.widths, plan.neck, plan.full
         self.stem = nn.Sequential(
-            convolution(3, 16, 3, 2), convolution(16, first, 3, 2), Residual(first)
+            convolution(3, plan.first, 3, 2),
+            convolution(plan.first, widths[0], 3, 2),
+            Residual(widths[0], full),
         )
         self.down = nn.ModuleList(
-            nn.Sequential(*separable(a, b, 2), nn.ReLU(), *(Residual(b) for _ in range(blocks)))
-            for (a, b), blocks in zip(pairwise(WIDTHS), BLOCKS, strict=True)
+            nn.Sequential(
+                *(normed(a, b, 3, 2) if full else separable(a, b, 2)),
+                nn.ReLU(),
+                *(Residual(b, full) for _ in range(blocks)),
+            )
+            for (a, b), blocks in zip(pairwise(widths), BLOCKS, strict=True)
         )
-        self.lateral = nn.ModuleList(nn.Conv2d(width, NECK, 1) for width in WIDTHS)
-        self.merge = nn.ModuleList(Residual(NECK) for _ in WIDTHS)
-        last = nn.Conv2d(NECK, CHANNELS, 1)
+        self.lateral = nn.ModuleList(nn.Conv2d(width, neck, 1) for width in widths)
+        self.merge = nn.ModuleList(Residual(neck, full) for _ in widths)
+        last = nn.Conv2d(neck, CHANNELS, 1)
         bias = torch.zeros(CHANNELS)
         bias[HEAT] = -4.0  # few cells are centres
         bias[RADIUS] = 1.5  # 18 px
         last.bias = nn.Parameter(bias)
-        self.head = nn.Sequential(convolution(NECK, NECK, 1), last)
+        self.head = nn.Sequential(convolution(neck, neck, 1), last)
 
     def forward(self, image: Tensor) -> Tensor:
         """Return the raw output."""
@@ -112,3 +144,24 @@ def loss_of(output: Tensor, target: Tensor, weight: Tensor) -> Tensor:
     offset = ((output[:, OFFSET] - target[:, OFFSET]).abs().sum(dim=1) * inside).sum() / count
     mask = functional.binary_cross_entropy_with_logits(output[:, MASK], target[:, MASK])
     return focal + 2.0 * radius + 0.5 * offset + mask
+
+
+def guided_loss(output: Tensor, guide: Tensor, target: Tensor) -> Tensor:
+    """Return how far an output (B, 5, h, w) is from that of a large network (Hinton et al. 2015).
+
+    Relative entropy of the heat, more where both differ, as in the quality focal loss (Li et al.
+    2020, arXiv 2006.04388, equation 2), per centre in the target (B, 5, h, w); L1 for radius and
+    offset as far as the guide sees a centre there; cross entropy for the mask.
+    """
+    entropy = functional.binary_cross_entropy_with_logits
+    chance, own = guide[:, HEAT].sigmoid(), output[:, HEAT].detach().sigmoid()
+    away = entropy(output[:, HEAT], chance, reduction="none")
+    away = away - entropy(guide[:, HEAT], chance, reduction="none")
+    centers = (target[:, HEAT] >= 0.999).sum().clamp(min=8)
+    heat = (away * (chance - own).abs().clamp(min=0.02)).sum() / centers
+    seen = chance * (chance > 0.2)
+    count = seen.sum().clamp(min=8)
+    radius = ((output[:, RADIUS] - guide[:, RADIUS]).abs() * seen).sum() / count
+    offset = ((output[:, OFFSET] - guide[:, OFFSET]).abs().sum(dim=1) * seen).sum() / count
+    mask = entropy(output[:, MASK], guide[:, MASK].sigmoid())
+    return 3.0 * heat + 2.0 * radius + 0.5 * offset + mask

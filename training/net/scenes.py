@@ -151,11 +151,12 @@ def main() -> None:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cache", type=Path, default=Path("out/net"), help="rendered frames")
+    parser.add_argument("--frames", type=int, default=TRAINING, help="to train on")
     parser.add_argument("--part", type=int, default=0, help="this process' number")
     parser.add_argument("--of", type=int, default=1, help="how many processes share the work")
     arguments = parser.parse_args()
     seeds = [*range(VALIDATION_SEED, VALIDATION_SEED + VALIDATION)]
-    seeds += range(TRAINING_SEED, TRAINING_SEED + TRAINING)
+    seeds += range(TRAINING_SEED, TRAINING_SEED + arguments.frames)
     for seed in seeds[arguments.part :: arguments.of]:
         picture(seed, arguments.cache)
 

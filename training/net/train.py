@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import copy
+import math
 import time
 from collections.abc import Iterable, Iterator
 from itertools import islice
@@ -15,11 +16,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import nn
-from torch.utils.data import DataLoader, IterableDataset
+from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from training.net.augment import crop
 from training.net.model import CapNet, loss_of
 from training.net.scenes import TRAINING, TRAINING_SEED, Picture, picture
+from training.net.texture import Singles
 
 SIZE, BATCH, RATE, DECAY = 224, 8, 2.5e-3, 0.998
 NEAR = 0.3  # share of the crops that are taken around a cap
@@ -28,53 +30,78 @@ Batch = tuple[torch.Tensor, ...]
 
 
 class Crops(IterableDataset[Batch]):
-    """Batches from the frames without end, with a generator of their own."""
+    """Batches from the frames without end, with a generator of their own in each process."""
 
-    def __init__(self, frames: list[Picture], seed: int, stained: bool) -> None:
-        self._frames, self._seed, self._stained = frames, seed, stained
+    def __init__(
+        self, frames: list[Picture], seed: int, stained: float, surfaces: bool, batch: int
+    ) -> None:
+        self._frames, self._seed, self._batch = frames, seed, batch
+        self._stained, self._surfaces = stained, surfaces
 
     def __iter__(self) -> Iterator[Batch]:
         """Yield images, targets and weights."""
-        rng = np.random.default_rng([self._seed, 9])
+        worker = get_worker_info()
+        rng = np.random.default_rng([self._seed, 9 + (worker.id if worker else 0)])
         while True:
-            picks = rng.integers(len(self._frames), size=BATCH)
-            rows = [crop(self._frames[k], SIZE, rng, NEAR, self._stained) for k in picks]
+            picks = rng.integers(len(self._frames), size=self._batch)
+            rows = [self._cut(self._frames[k], rng) for k in picks]
             yield tuple(torch.from_numpy(np.stack(part)) for part in zip(*rows, strict=True))
 
-
-def averaged(slow: nn.Module, fast: nn.Module, step: int) -> None:
-    """Move the running mean of the weights towards the current ones, faster at the start."""
-    keep = min(DECAY, (1 + step) / (10 + step))
-    with torch.no_grad():
-        for a, b in zip(slow.state_dict().values(), fast.state_dict().values(), strict=True):
-            if a.is_floating_point():
-                a.lerp_(b, 1 - keep)
-            else:
-                a.copy_(b)
+    def _cut(self, frame: Picture, rng: np.random.Generator) -> tuple[Singles, Singles, Singles]:
+        share = self._stained
+        stained = share == 1 or (share > 0 and rng.random() < share)
+        return crop(frame, SIZE, rng, NEAR, stained, self._surfaces)
 
 
-def train(net: CapNet, batches: Iterable[Batch], steps: int, rate: float, out: Path) -> None:
-    """Train a network and write the running mean of its weights, every hundred steps.
+class Learner:
+    """A network that learns, and the running mean of its weights.
 
     AdamW with a linear warm-up over 100 steps and a cosine to zero.
+
+    Attributes:
+        net: What learns.
+        slow: The same with the mean of its weights; this one is used in the end.
     """
-    net = net.to(memory_format=torch.channels_last)
-    slow = copy.deepcopy(net)
-    optimizer = torch.optim.AdamW(net.parameters(), rate, weight_decay=1e-3)
-    schedule = torch.optim.lr_scheduler.LambdaLR(
-        optimizer,
-        lambda k: min(1.0, (k + 1) / 100) * 0.5 * (1 + np.cos(np.pi * k / steps)),
-    )
+
+    def __init__(self, net: CapNet, steps: int, rate: float, decay: float = DECAY) -> None:
+        self.net = net.to(memory_format=torch.channels_last)
+        self.slow = copy.deepcopy(self.net)
+        self._steps, self._decay, self._step = steps, decay, 0
+        self._optimizer = torch.optim.AdamW(net.parameters(), rate, weight_decay=1e-3)
+        self._schedule = torch.optim.lr_scheduler.LambdaLR(self._optimizer, self._rate)
+
+    def _rate(self, step: int) -> float:
+        return min(1.0, (step + 1) / 100) * 0.5 * (1 + math.cos(math.pi * step / self._steps))
+
+    def learn(self, loss: torch.Tensor) -> None:
+        """Take a step."""
+        self._optimizer.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(self.net.parameters(), 5.0)
+        self._optimizer.step()
+        self._schedule.step()
+        self._average()
+
+    def _average(self) -> None:
+        """Move the running mean towards the current weights, faster at the start."""
+        keep = min(self._decay, (1 + self._step) / (10 + self._step))
+        self._step += 1
+        pairs = zip(self.slow.state_dict().values(), self.net.state_dict().values(), strict=True)
+        with torch.no_grad():
+            for a, b in pairs:
+                if a.is_floating_point():
+                    a.lerp_(b, 1 - keep)
+                else:
+                    a.copy_(b)
+
+
+def train(learner: Learner, batches: Iterable[Batch], steps: int, out: Path) -> None:
+    """Train a network and write the running mean of its weights, every hundred steps."""
     began, total = time.monotonic(), 0.0
     for step, (image, target, weight) in enumerate(islice(batches, steps)):
-        output = net(image.to(memory_format=torch.channels_last))
+        output = learner.net(image.to(memory_format=torch.channels_last))
         loss = loss_of(output, target, weight)
-        optimizer.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(net.parameters(), 5.0)
-        optimizer.step()
-        schedule.step()
-        averaged(slow, net, step)
+        learner.learn(loss)
         total += loss.item()
         if step % 100 == 99:
             print(
@@ -82,7 +109,7 @@ def train(net: CapNet, batches: Iterable[Batch], steps: int, rate: float, out: P
                 flush=True,
             )
             total = 0.0
-            torch.save(slow.state_dict(), out)
+            torch.save(learner.slow.state_dict(), out)
 
 
 def main() -> None:
@@ -103,9 +130,10 @@ def main() -> None:
     net = CapNet()
     if arguments.start:
         net.load_state_dict(torch.load(arguments.start))
-    crops = Crops(frames, arguments.seed, arguments.stained)
+    crops = Crops(frames, arguments.seed, float(arguments.stained), False, BATCH)
     batches = DataLoader(crops, batch_size=None, num_workers=1)  # cut by a process of its own
-    train(net, batches, arguments.steps, arguments.rate, arguments.out)
+    learner = Learner(net, arguments.steps, arguments.rate)
+    train(learner, batches, arguments.steps, arguments.out)
 
 
 if __name__ == "__main__":
