@@ -35,7 +35,7 @@ def share_at(done: float) -> float:
 def teach(
     small: Learner, large: Learner, batches: Iterable[Batch], steps: int, out: Path, device: str
 ) -> None:
-    """Train both and write the running mean of the small one's weights, every hundred steps."""
+    """Train both and write the running mean of the small one's weights now and then."""
     began, total = time.monotonic(), torch.zeros(2, device=device)
     large.slow.eval()
     for step, batch in enumerate(islice(batches, steps)):
@@ -49,8 +49,8 @@ def teach(
         own = loss_of(output, target, weight)
         small.learn((1 - share) * own + share * guided_loss(output, guide, target))
         total += torch.stack([hard, own]).detach()
-        if step % 100 == 99:
-            losses = ", ".join(f"{value:.3f}" for value in (total / 100).tolist())
+        if step % 100 == 99 or step == steps - 1:
+            losses = ", ".join(f"{value:.3f}" for value in (total / (step % 100 + 1)).tolist())
             print(f"step {step + 1}: {losses}, {time.monotonic() - began:.0f} s", flush=True)
             total.zero_()
             torch.save({name: one.cpu() for name, one in small.slow.state_dict().items()}, out)
