@@ -74,13 +74,18 @@ def recordings_in(paths: Sequence[Path]) -> list[Path]:
 
 def unique_names(files: Sequence[Path]) -> list[str]:
     """Return the names of files without folder and suffix, numbered where several have one."""
-    stems, names = [file.stem for file in files], list[str]()
-    for number, stem in enumerate(stems):
-        name = stem if stems.count(stem) == 1 else f"{stem}-{number}"
-        while name in names or (name != stem and name in stems):
+    return numbered([file.stem for file in files])
+
+
+def numbered(names: Sequence[str]) -> list[str]:
+    """Return names, with their number behind where several are the same."""
+    result = list[str]()
+    for number, own in enumerate(names):
+        name = own if names.count(own) == 1 else f"{own}-{number}"
+        while name in result or (name != own and name in names):
             name += "-"
-        names.append(name)
-    return names
+        result.append(name)
+    return result
 
 
 def plan_for(
@@ -141,9 +146,9 @@ def plans(
     sources: Sequence[Path | None] = recordings or [None]
     names = unique_names(recordings) or ["results"]
     result = []
-    for option in options:
+    for option, label in zip(options, numbered([slug(each) for each in options]), strict=True):
         for number, (name, recording) in enumerate(zip(names, sources, strict=True)):
-            file = out / ".".join(filter(None, [name, slug(option), "mcap"]))
+            file = out / ".".join(filter(None, [name, label, "mcap"]))
             plan = plan_for(graph, recording, [*overrides, *option.overrides], file, registry)
             result.append((option, number, plan))
     return result

@@ -17,7 +17,7 @@ from mushpipe.cli import app
 from mushpipe.core.errors import EXIT_DAMAGED, EXIT_DIFFERS, InputError, UsageError
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.wire import table_schema
-from mushpipe.evaluate.running import unique_names
+from mushpipe.evaluate.running import Alternative, plans, result_path, unique_names
 from tests.evaluate.scenes import (
     bed,
     header,
@@ -428,6 +428,14 @@ def test_recordings_may_follow_the_graph_and_folders_are_opened(
     (only,) = content["alternatives"]
     assert [r["name"] for r in only["recordings"]] == ["bed", "x", "y"]
     assert only["overall"]["frames"] == 3
+
+
+def test_results_of_alternatives_never_share_a_file(graph: Path, tmp_path: Path) -> None:
+    options = [Alternative(f"net.model={value}") for value in ("a/b.onnx", "a_b.onnx", "c.onnx")]
+    runs = plans(graph, [tmp_path / "bed.mcap"], (), options, tmp_path / "out")
+    files = [result_path(plan).name for *_, plan in runs]
+    ways = ("a_b.onnx-0", "a_b.onnx-1", "c.onnx")
+    assert files == [f"bed.net.model={way}.mcap" for way in ways]
 
 
 def test_matrix_compares_on_the_same_frames(graph: Path, tmp_path: Path) -> None:
