@@ -82,21 +82,10 @@ def test_a_source_without_frames_has_no_figures(lab: Lab) -> None:
         bench(lambda _: lab.compile(lab.chain("threshold"), "source.count=0"), 10)
 
 
-class Fails(Stage):
-    """Fails on all frames, or on every other."""
-
-    every: int = 2
-
-    def process(self, frame: RgbdFrame) -> Circles:
-        if frame.header.sequence % self.every == 0:
-            raise RuntimeError("as told")
-        return circles(1.0)
-
-
 @pytest.mark.parametrize(("every", "failed"), [(2, 20), (4, 10)])
 def test_frames_that_failed_are_told(lab: Lab, every: int, failed: int) -> None:
-    text = lab.chain(Fails) + "\non_error: skip\n"
-    result = bench(lambda count: lab.compile(text, f"source.count={count}", f"a.every={every}"), 40)
+    text, on = lab.chain("fussy", extra="on_error: skip"), [*range(0, 40, every)]
+    result = bench(lambda count: lab.compile(text, f"source.count={count}", f"a.on={on}"), 40)
     assert (result["frames"], result["failed"]) == (40 - failed, failed)
 
 

@@ -18,7 +18,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from training.net.model import LARGE, SMALL, CapNet, guided_loss, loss_of
-from training.net.scenes import TRAINING_SEED, picture
+from training.net.scenes import TRAINING_SEED, pictures
 from training.net.train import Batch, Crops, Learner
 
 FRAMES, STEPS, BATCH = 1000, 19772, 32
@@ -69,7 +69,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.backends.cudnn.allow_tf32 = torch.backends.cudnn.benchmark = True
     torch.manual_seed(arguments.seed)
-    frames = [picture(TRAINING_SEED + k, arguments.cache) for k in range(arguments.frames)]
+    frames = list(pictures(TRAINING_SEED, arguments.frames, arguments.cache))
     crops = Crops(frames, arguments.seed, STAINED, True, BATCH)
     batches = DataLoader(crops, batch_size=None, num_workers=arguments.workers)
     small, large = (

@@ -35,7 +35,7 @@ def individual(image: Singles, cap: Singles, circles: Floats, rng: np.random.Gen
     spread, tint = rng.uniform(0.1, 0.4), rng.uniform(0, 0.1)
     for x, y, radius in circles:
         own = np.exp(rng.normal(0, spread) + rng.normal(0, tint, 3)).tolist()
-        cv2.circle(gain, _pixel(np.array((x, y))), max(1, round(radius)), own, -1, cv2.LINE_AA)
+        cv2.circle(gain, (round(x), round(y)), max(1, round(radius)), own, -1, cv2.LINE_AA)
     return np.asarray(image * (1 + cap[..., None] * (gain - 1)), np.float32)
 
 

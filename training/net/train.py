@@ -20,7 +20,7 @@ from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from training.net.augment import crop
 from training.net.model import CapNet, loss_of
-from training.net.scenes import TRAINING, TRAINING_SEED, Picture, picture
+from training.net.scenes import TRAINING, TRAINING_SEED, Picture, pictures
 from training.net.texture import Singles
 
 SIZE, BATCH, RATE, DECAY = 224, 8, 2.5e-3, 0.998
@@ -48,7 +48,7 @@ class Crops(IterableDataset[Batch]):
             yield tuple(torch.from_numpy(np.stack(part)) for part in zip(*rows, strict=True))
 
     def _cut(self, frame: Picture, rng: np.random.Generator) -> tuple[Singles, Singles, Singles]:
-        share = self._stained
+        share = self._stained  # all or none takes no draw: seeds of `main` keep their crops
         stained = share == 1 or (share > 0 and rng.random() < share)
         return crop(frame, SIZE, rng, NEAR, stained, self._surfaces)
 
@@ -66,7 +66,7 @@ class Learner:
     def __init__(self, net: CapNet, steps: int, rate: float, decay: float = DECAY) -> None:
         self.net = net.to(memory_format=torch.channels_last)
         self.slow = copy.deepcopy(self.net)
-        self._steps, self._decay, self._step = steps, decay, 0
+        self._steps, self._decay = steps, decay
         self._optimizer = torch.optim.AdamW(net.parameters(), rate, weight_decay=1e-3)
         self._schedule = torch.optim.lr_scheduler.LambdaLR(self._optimizer, self._rate)
 
@@ -84,8 +84,8 @@ class Learner:
 
     def _average(self) -> None:
         """Move the running mean towards the current weights, faster at the start."""
-        keep = min(self._decay, (1 + self._step) / (10 + self._step))
-        self._step += 1
+        taken = self._schedule.last_epoch
+        keep = min(self._decay, taken / (9 + taken))
         pairs = zip(self.slow.state_dict().values(), self.net.state_dict().values(), strict=True)
         with torch.no_grad():
             for a, b in pairs:
@@ -124,8 +124,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("out/net/cap-net.pt"))
     arguments = parser.parse_args()
-    seeds = range(TRAINING_SEED, TRAINING_SEED + arguments.frames)
-    frames = [picture(seed, arguments.cache) for seed in seeds]
+    frames = list(pictures(TRAINING_SEED, arguments.frames, arguments.cache))
     torch.manual_seed(arguments.seed)
     net = CapNet()
     if arguments.start:
