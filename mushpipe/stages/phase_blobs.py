@@ -18,7 +18,7 @@ from mushpipe.stages.phase_depth import CELL, Relief
 from mushpipe.stages.phase_edges import Plane
 from mushpipe.stages.phase_votes import highest_around
 
-LEVELS = (0.01, 0.02, 0.035)  # m over the bed
+LEVELS = (0.01, 0.014, 0.02, 0.028, 0.035, 0.05)  # m over the bed
 STEP = 2  # px of the height map; a start for a refit need not be more exact
 REACH = 2  # steps around a peak within which it must be the highest
 FREE = 0.55  # share of the ring around a disc that is lower, for it to be a thing of its own
