@@ -1,6 +1,8 @@
 """Accepting candidates one by one: each explains its edges away for those that come after it.
 
-The candidate with the largest probability is accepted, and its edges are used up. Its neighbours
+The candidate with the largest probability is accepted, and its edges are used up; of those that are
+likely the one that a network agrees with most comes first, where there is one: what depth does not
+see, or sees twice, makes a rival of the same probability that lies beside the cap. Its neighbours
 are then looked at again: another circle on the same cap has lost its support, while one below it
 need no longer show the outline that it hides. This is the non-maximum suppression of the detector.
 """
@@ -15,6 +17,7 @@ from numpy.typing import NDArray
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.discs import lens
 from mushpipe.stages.phase_edges import Rows, Shape, Singles
+from mushpipe.stages.phase_features import LEARNED, NAMES
 from mushpipe.stages.phase_refit import (
     COSINES,
     HIDDEN,
@@ -28,8 +31,11 @@ from mushpipe.stages.phase_scratch import Scratch, scratch_for
 from mushpipe.stages.phase_strips import Strips
 from mushpipe.stages.verifier_net import Models, probability
 
+_LEARNED = NAMES.index(LEARNED)
 MARGIN = 1.0  # px; so far within an accepted circle an outline counts as hidden by it
 HOPELESS = 2e-5  # probability from which on nothing that is accepted later can help
+LIKELY = 0.5  # probability from which on a circle is more likely a cap than not
+AGREED = 3.0  # of `learned` in the order of those that are likely, of a probability 1
 TAKEN = 2.5  # px; edges so near an accepted outline are its own
 
 
@@ -128,7 +134,7 @@ def decide(
     edges: Strips, shapes: Table, hits: Rows, table: Table, which: Rows, models: Models,
     least: float,
 ) -> tuple[Rows, Table, Rows]:  # fmt: skip
-    """Accept candidates in the order of their probability.
+    """Accept candidates in the order of their probability, and of a network's agreement.
 
     Args:
         edges: Edge points.
@@ -155,10 +161,14 @@ def decide(
             edges, shapes[k], hits[k], owner, near[:0], table[k], models, which[k], scratch
         )
     for count in range(n):
-        best, top = -1, least
+        best, top = -1, 0.0
         for k in range(n):
-            if waiting[k] and chance[k] >= top:
-                best, top = k, chance[k]
+            if waiting[k] and chance[k] >= least:
+                rank = chance[k]
+                if chance[k] >= LIKELY:
+                    rank += AGREED * table[k, _LEARNED]
+                if rank >= top:
+                    best, top = k, rank
         if best < 0:
             return order[:count], chance, owner
         waiting[best], order[count] = False, best

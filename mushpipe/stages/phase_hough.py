@@ -14,7 +14,7 @@ from mushpipe import Circles, Mask, RgbdFrame, Stage, UsageError
 from mushpipe.core.paths import GraphPath
 from mushpipe.stages.doubling import doubled
 from mushpipe.stages.phase_blobs import blobs_of
-from mushpipe.stages.phase_decide import decide
+from mushpipe.stages.phase_decide import LIKELY, decide
 from mushpipe.stages.phase_depth import NO_RELIEF, Relief, relief_of
 from mushpipe.stages.phase_edges import (
     Gradient,
@@ -30,6 +30,7 @@ from mushpipe.stages.phase_learned import (
     add_discs,
     agreement,
     candidates_of,
+    certain_first,
     largest_of,
     with_bare,
     within,
@@ -54,7 +55,6 @@ _BESIDE = 0.2  # the same beside a network: what has less it sees as well, and f
 _EVERY = 2  # edge points; of so many one votes where network and depth bring candidates as well
 _SEEN = 0.1  # of `learned`; without depth, what the network sees less of is no cap
 _SURE = 0.8  # of a network's circle, from which on it is taken for a cap though it has no outline
-_LIKELY = 0.5  # score from which on a circle is more likely a cap than not
 _LARGE = 80.0  # px; radius up to which caps are looked for in any case where [8, null] is set
 _SMALLEST = 12  # px; images smaller than this in either direction hold no circle
 
@@ -168,7 +168,7 @@ class PhaseHough(Stage):
         shapes, score = found.shapes[order], chance[order]
         # What is hardly a cap changes nothing about those that are likely: it takes no edges from
         # them, and what is a cap only beside it is no more likely than it is.
-        after = np.logical_or.accumulate(score < _LIKELY)
+        after = np.logical_or.accumulate(score < LIKELY)
         score[after] = np.minimum.accumulate(score[after])
         owner[np.isin(owner, np.flatnonzero(after))] = -1
         polish(found.edges, found.height, found.pixel, shapes, owner, *found.range)
@@ -177,10 +177,10 @@ class PhaseHough(Stage):
             return circles
         if len(found.height):
             unseen = found.table[order, NAMES.index(LEARNED)] == 0
-            return without_clods(frame.color, circles, unseen)
+            return certain_first(without_clods(frame.color, circles, unseen))
         sure = found.learned.take(found.learned.score >= max(_SURE, self.min_score))
         radius = equal_area_radius(found.shapes)
-        return with_bare(circles, sure, found.shapes, radius, order[score >= _LIKELY])
+        return with_bare(circles, sure, found.shapes, radius, order[score >= LIKELY])
 
     def gather(
         self, frame: RgbdFrame, mask: Mask, learned: Circles | None = None
@@ -246,7 +246,7 @@ class PhaseHough(Stage):
         smallest, largest = self.radius_px or (8.0, 38.0)
         if largest is None:
             by_depth = self.diameter_mm[1] / 2000 / relief.pixel if relief else 0
-            largest = max(_LARGE, by_depth, largest_of(learned, _LIKELY))
+            largest = max(_LARGE, by_depth, largest_of(learned, LIKELY))
         if self.radius_px is None and relief is not None:
             # a cap is nearer than the bed, hence larger in the image
             near = relief.bed_pixel(*np.array([(0, width, 0, width), (0, 0, height, height)]))

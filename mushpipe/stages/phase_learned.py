@@ -76,6 +76,11 @@ def without_clods(color: NDArray[np.uint8], circles: Circles, unseen: NDArray[np
     return circles.take(~(away < _GROUND))
 
 
+def certain_first(circles: Circles) -> Circles:
+    """Return the circles in the order of their scores."""
+    return circles.take(np.argsort(-circles.score, kind="stable"))
+
+
 def with_bare(
     circles: Circles, sure: Circles, shapes: Table, radius: Table, likely: Rows
 ) -> Circles:
@@ -85,7 +90,7 @@ def with_bare(
     something bright may count as none. Where there is an outline, the verifier says what it is.
 
     Args:
-        circles: Those accepted, the most certain first.
+        circles: Those accepted.
         sure: Those of the network, of a radius within the range.
         shapes: (N, 5) outlines that were found.
         radius: (N,) of their circles.
@@ -94,10 +99,9 @@ def with_bare(
     taken = np.zeros(len(shapes), np.bool_)
     taken[likely] = True
     more = sure.take(_bare(sure.center, sure.radius, shapes, radius, taken))
-    score = np.append(circles.score, more.score)
-    first = np.argsort(-score, kind="stable")
     center = np.concatenate([circles.center, more.center])
-    return Circles(center[first], np.append(circles.radius, more.radius)[first], score[first])
+    radius, score = np.append(circles.radius, more.radius), np.append(circles.score, more.score)
+    return certain_first(Circles(center, radius, score))
 
 
 @jit
