@@ -98,11 +98,10 @@ def _compile(settings: dict[str, Any], overrides: list[Any], source: str) -> Pla
 
 def _files(plan: Plan) -> list[Path]:
     """Return the files of the recording that exist."""
-    from mushpipe.core.stage import RunInfo, Sink, Source
+    from mushpipe.core.stage import RunInfo, Sink
 
-    source, sink = plan.source.plugin, plan.sinks[0].plugin
-    name = source.name() if isinstance(source, Source) else ""
-    files = sink.files(RunInfo(name, {})) if isinstance(sink, Sink) else ()
+    sink = plan.sinks[0].plugin
+    files = sink.files(RunInfo(plan.recording(), {})) if isinstance(sink, Sink) else ()
     return [path for path in files if path.is_file()]
 
 

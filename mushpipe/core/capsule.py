@@ -12,7 +12,6 @@ from mushpipe.core.errors import UsageError
 from mushpipe.core.plan import Node, Plan
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.recording import GRAPH, RecordingReader
-from mushpipe.core.stage import Source
 from mushpipe.core.types import RgbdFrame
 
 
@@ -24,10 +23,8 @@ def write_capsule(folder: Path, plan: Plan, node: Node, frame: RgbdFrame, messag
     capsule: running it must not reach a robot or write over results.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    source = plan.source.plugin
-    name = source.name() if isinstance(source, Source) else ""
     number = frame.header.sequence if plan.replay() else frame.header.stamp_ns
-    path = folder / f"failure-{name}-{node.name}-{number}.mcap"
+    path = folder / f"failure-{plan.recording()}-{node.name}-{number}.mcap"
     kept = replace(
         plan,
         stages=tuple(map(_anchored, plan.stages)),

@@ -15,14 +15,10 @@ _EVERYTHING = "everything"
 _DOT_SHAPES = {"source": "oval", "stage": "box", "sink": "parallelogram"}
 
 
-def _nodes(plan: Plan) -> tuple[Node, ...]:
-    return (plan.source, *plan.stages, *plan.sinks)
-
-
 def _edges(plan: Plan) -> Iterator[tuple[str, str, str]]:
     """Yield (producer, consumer, type); a sink that takes everything hangs below the last stage."""
-    types = {node.name: node.ports.outputs for node in _nodes(plan)}
-    for node in _nodes(plan):
+    types = {node.name: node.ports.outputs for node in plan.nodes}
+    for node in plan.nodes:
         for link in node.links.values():
             yield link.producer, node.name, types[link.producer][link.output].__name__
         if any(port.type is Trace for port in node.ports.inputs):
@@ -41,9 +37,9 @@ def _text(node: Node) -> tuple[str, str]:
 
 def mermaid(plan: Plan) -> str:
     """Return a Mermaid flowchart, edges labelled with port types."""
-    ids = {node.name: f"n{i}" for i, node in enumerate(_nodes(plan))}
+    ids = {node.name: f"n{i}" for i, node in enumerate(plan.nodes)}
     lines = ["flowchart TD"]
-    for node in _nodes(plan):
+    for node in plan.nodes:
         begin, end = _SHAPES[node.kind]
         name, detail = _text(node)
         lines.append(f'  {ids[node.name]}{begin}"{name}<br/><small>{detail}</small>"{end}')
@@ -56,7 +52,7 @@ def mermaid(plan: Plan) -> str:
 def dot(plan: Plan) -> str:
     """Return a Graphviz digraph, edges labelled with port types."""
     lines = ["digraph mushpipe {"]
-    for node in _nodes(plan):
+    for node in plan.nodes:
         name, detail = _text(node)
         label = f"{name}\\n{detail}".replace('"', '\\"')
         lines.append(f'  "{name}" [shape={_DOT_SHAPES[node.kind]}, label="{label}"];')

@@ -61,9 +61,9 @@ def files_read(plan: Plan) -> tuple[Path, ...]:
         StageError: The source's ``files`` failed.
         PluginError: It gave no paths.
     """
-    nodes = (plan.source, *plan.stages, *plan.sinks)
-    code = (node.use.rpartition(":")[0] for node in nodes if in_file(node.use))
-    given = (path for node in nodes for path in node.plugin.path_settings(written=False).values())
+    code = (node.use.rpartition(":")[0] for node in plan.nodes if in_file(node.use))
+    read = (node.plugin.path_settings(written=False) for node in plan.nodes)
+    given = (path for paths in read for path in paths.values())
     graph = Path(plan.file)
     return (graph, *(graph.parent / file for file in code), *given, *files_of(plan.source))
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from mushpipe.core.edges import files_of
 from mushpipe.core.plan import Plan
-from mushpipe.core.stage import RunInfo, Source
+from mushpipe.core.stage import RunInfo
 
 _LIBRARIES = ("mushpipe", "numpy", "opencv-python-headless", "scikit-image", "scipy", "mcap")
 
@@ -39,8 +39,7 @@ def _describe(path: Path) -> dict[str, Any]:
 
 
 def _versions(plan: Plan) -> dict[str, str]:
-    nodes = (plan.source, *plan.stages, *plan.sinks)
-    packages = {type(node.plugin).__module__.partition(".")[0] for node in nodes}
+    packages = {type(node.plugin).__module__.partition(".")[0] for node in plan.nodes}
     found = {}
     for name in sorted({*_LIBRARIES, *packages}):
         try:
@@ -52,8 +51,7 @@ def _versions(plan: Plan) -> dict[str, str]:
 
 def manifest_path(plan: Plan) -> Path:
     """Return where a run's manifest goes: beside its first result file, else ``run.json``."""
-    source = plan.source.plugin
-    info = RunInfo(source.name() if isinstance(source, Source) else "", {})
+    info = RunInfo(plan.recording(), {})
     for node in plan.sinks:
         for path in files_of(node, info):
             return path.with_suffix(".run.json")

@@ -75,8 +75,7 @@ class _Runner:
         self.stop = stop
         self.progress = progress
         self.capsules = capsules
-        nodes = (plan.source, *plan.stages, *plan.sinks)
-        self.report = RunReport(durations={node.name: Durations() for node in nodes})
+        self.report = RunReport(durations={node.name: Durations() for node in plan.nodes})
         self.chain = Chain(plan)
         self.entrance, self.exit = threading.Lock(), Turnstile()
         self.taken = 0  # frames, and so the next ticket

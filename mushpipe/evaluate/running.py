@@ -14,7 +14,7 @@ from mushpipe.core.graph import compile_document
 from mushpipe.core.plan import Plan
 from mushpipe.core.plugins import Registry, load_registry
 from mushpipe.core.report import RunReport
-from mushpipe.core.stage import RunInfo, Sink, Source
+from mushpipe.core.stage import RunInfo, Sink
 
 SINK = "evaluation"
 
@@ -111,12 +111,10 @@ def plan_for(
 
 def result_path(plan: Plan) -> Path:
     """Return the file that a plan made by `plan_for` writes."""
-    source = plan.source.plugin
-    info = RunInfo(source.name() if isinstance(source, Source) else "", {})
     sink = plan.sinks[0].plugin
     if not isinstance(sink, Sink):
         raise TypeError("the plan has no sink")
-    return sink.files(info)[0]
+    return sink.files(RunInfo(plan.recording(), {}))[0]
 
 
 def slug(alternative: Alternative) -> str:

@@ -80,7 +80,7 @@ def test_every_builtin_plugin_appears_in_a_replay() -> None:
     used = set(ELSEWHERE)
     for graph in graphs:
         plan = compile_document(read_document(graph), registry)
-        used |= {node.use for node in (plan.source, *plan.stages, *plan.sinks)}
+        used |= {node.use for node in plan.nodes}
     builtin = {
         entry.name for found in registry.entries.values() for entry in found
         if entry.distribution == "mushpipe"
