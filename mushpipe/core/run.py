@@ -77,6 +77,8 @@ class _Runner:
         self.capsules = capsules
         self.report = RunReport(durations={node.name: Durations() for node in plan.nodes})
         self.chain = Chain(plan)
+        self.reader: SourceThread
+        self.feeders: list[SinkThread] = []
         self.entrance, self.exit = threading.Lock(), Turnstile()
         self.taken = 0  # frames, and so the next ticket
         self.over = False  # what is still on its way then is late
@@ -98,8 +100,8 @@ class _Runner:
             with interruptible_opening(source, self.stop):
                 stack.enter_context(opened(self.plan.source, opener(self.plan.source)))
             durations = self.report.durations[self.plan.source.name]
-            reader = SourceThread(self.plan.source, source, threading.Event(), durations)
-            info = self._begin(source, reader)
+            self.reader = SourceThread(self.plan.source, source, threading.Event(), durations)
+            info = self._begin(source)
             written = {node.name: files_of(node, info) for node in self.plan.sinks}
             spare_files(files_read(self.plan), written)
             # Who writes a file empties it: not before all that may fail without has opened.
@@ -109,35 +111,35 @@ class _Runner:
             self.report.files = tuple(path for paths in written.values() for path in paths)
             self.report.opened = True
             self.started = time.monotonic()  # what opening took is no part of the frames' pace
-            threads = [self._sink_thread(node) for node in self.plan.sinks]
+            self.feeders = [self._sink_thread(node) for node in self.plan.sinks]
             stack.enter_context(cores_shared())
             try:
-                self._loop(reader, threads)
+                self._loop()
             except StageError as error:
                 self.report.error = error
             finally:
-                self._wind_up(reader, source, threads)
-            self._finish(threads)
+                self._wind_up(source)
+            self._finish()
 
-    def _begin(self, source: Source, reader: SourceThread) -> RunInfo:
+    def _begin(self, source: Source) -> RunInfo:
         """Return what the sinks are told, now that the source is open."""
         on_error = self.plan.on_error or ("fail" if self.plan.replay() else "skip")
         self.tolerance = self.plan.max_failures if on_error == "skip" else 1
         with named(self.plan.source):
             device = self.report.device = plain(source.describe())
             manifest = {**self.report.manifest, **({"device": device} if device else {})}
-            return RunInfo(source.name(), manifest, source.live, lambda: reader.box.accepted)
+            return RunInfo(source.name(), manifest, source.live, lambda: self.reader.box.accepted)
 
-    def _finish(self, threads: list[SinkThread]) -> None:
+    def _finish(self) -> None:
         """Tell the sinks how the run went; the first error of the run stays the one reported."""
-        for thread in threads:
-            plugin = thread.node.plugin
-            if not isinstance(plugin, Sink) or thread.error is not None:
+        for feeder in self.feeders:
+            plugin = feeder.node.plugin
+            if not isinstance(plugin, Sink) or feeder.error is not None:
                 continue
             try:
                 plugin.finish(self.report.summary())
             except Exception as error:
-                failed = failure(thread.node, None, error)
+                failed = failure(feeder.node, None, error)
                 self.report.error = self.report.error or failed
                 logger.warning("%s", failed)
 
@@ -145,33 +147,31 @@ class _Runner:
         durations = self.report.durations[node.name]
         return SinkThread(node, self.plan.delivery(node) == "latest", self.tolerance, durations)
 
-    def _loop(self, reader: SourceThread, threads: list[SinkThread]) -> None:
+    def _loop(self) -> None:
         """Take frames through the stages on several threads, until they end or one fails."""
-        for thread in (reader, *threads):
-            thread.start()
+        for edge in (self.reader, *self.feeders):
+            edge.start()
         others = [
-            threading.Thread(
-                target=self._work, args=(reader, threads), name="mushpipe-stages", daemon=True
-            )
+            threading.Thread(target=self._work, name="mushpipe-stages", daemon=True)
             for _ in range(FRAMES_AT_ONCE - 1)
         ]
         for other in others:
             other.start()
-        self._work(reader, threads)
+        self._work()
         for other in others:
             other.join()
         self.report.interrupted = self.stop.is_set()
         if self.failure is not None:
             raise self.failure
 
-    def _work(self, reader: SourceThread, threads: list[SinkThread]) -> None:
+    def _work(self) -> None:
         try:
-            while (taken := self._take(reader, threads)) is not None:
+            while (taken := self._take()) is not None:
                 frame, left_ns, ticket = taken
                 passage = self.chain.passed(frame, ticket)
                 with self.exit.turn(ticket):
                     try:
-                        self._deliver(passage, left_ns, reader, threads)
+                        self._deliver(passage, left_ns)
                     except BaseException:  # before the turn ends: the next frame must not follow
                         self.over = True
                         raise
@@ -181,25 +181,21 @@ class _Runner:
             self.chain.close()
             self.exit.open()
 
-    def _at_end(self, threads: list[SinkThread]) -> bool:
-        return self.over or self.stop.is_set() or any(thread.error for thread in threads)
+    def _at_end(self) -> bool:
+        return self.over or self.stop.is_set() or any(feeder.error for feeder in self.feeders)
 
-    def _take(
-        self, reader: SourceThread, threads: list[SinkThread]
-    ) -> tuple[RgbdFrame, int, int] | None:
+    def _take(self) -> tuple[RgbdFrame, int, int] | None:
         """Return the next frame, when it left the source, and its ticket; None at the end."""
         with self.entrance:
             # Only now: a frame that waits at the first stage would grow old there.
             self.chain.await_first(self.taken)
-            while not (reader.box.finished or self._at_end(threads)):
-                if (item := reader.box.get(timeout=0.1)) is not None:
+            while not (self.reader.box.finished or self._at_end()):
+                if (item := self.reader.box.get(timeout=0.1)) is not None:
                     self.taken += 1
                     return *item, self.taken - 1
         return None
 
-    def _deliver(
-        self, passage: Passage, left_ns: int, reader: SourceThread, threads: list[SinkThread]
-    ) -> None:
+    def _deliver(self, passage: Passage, left_ns: int) -> None:
         """Count a frame and hand it to the sinks; one that comes after the end only waited."""
         if self.over:
             self.late += 1
@@ -217,12 +213,15 @@ class _Runner:
                 self.report.frame.add(sum(passage.durations_ns.values()))
             self.report.latency.add(time.perf_counter_ns() - left_ns)
             trace = passage.trace(left_ns)
-            for thread in threads:
-                thread.box.put((passage.frame, sink_inputs(thread.node, trace)))
-        self.report.read, self.report.dropped = reader.box.accepted, reader.box.dropped
+            for feeder in self.feeders:
+                feeder.box.put((passage.frame, sink_inputs(feeder.node, trace)))
+        self._count_read()
         if self.progress:
             self.progress(self.report)
-        self.over = self._at_end(threads)
+        self.over = self._at_end()
+
+    def _count_read(self) -> None:
+        self.report.read, self.report.dropped = self.reader.box.accepted, self.reader.box.dropped
 
     def _count_failure(self, frame: RgbdFrame, node: Node, error: BaseException) -> None:
         """Count a frame on which a stage failed; raise StageError where that ends the run."""
@@ -237,28 +236,28 @@ class _Runner:
             raise StageError(f"{failed}{many}", failed.exit_code) from error
         logger.warning("%s; the frame is skipped", failed)
 
-    def _wind_up(self, reader: SourceThread, source: Source, threads: list[SinkThread]) -> None:
+    def _wind_up(self, source: Source) -> None:
         """Stop the threads, let the sinks finish what they were handed, and settle the counts."""
-        reader.stop.set()
-        reader.box.close()
+        self.reader.stop.set()
+        self.reader.box.close()
         self._ask(source.interrupt)
-        for thread in threads:
-            thread.box.close()
-        for edge in (reader, *threads):
+        for feeder in self.feeders:
+            feeder.box.close()
+        for edge in (self.reader, *self.feeders):
             if edge.is_alive():
                 # A sink finishes what it was handed; a source may hang in a device.
-                edge.join(SOURCE_PATIENCE_S if edge is reader else None)
-        self.report.read, self.report.dropped = reader.box.accepted, reader.box.dropped
-        self.report.waiting = reader.box.waiting + self.late
+                edge.join(SOURCE_PATIENCE_S if edge is self.reader else None)
+        self._count_read()
+        self.report.waiting = self.reader.box.waiting + self.late
         self.report.elapsed_s = time.monotonic() - self.started
         self.report.source = self._ask(source.counts) or {}
-        for thread in threads:
-            self.report.sinks[thread.node.name] = thread.report()
-            if thread.error is not None:
-                self.report.error = self.report.error or thread.error
-                if thread.failed_frame is not None:
-                    self._save_capsule(thread.node, thread.failed_frame, thread.error)
-        self.report.error = self.report.error or reader.error
+        for feeder in self.feeders:
+            self.report.sinks[feeder.node.name] = feeder.report()
+            if feeder.error is not None:
+                self.report.error = self.report.error or feeder.error
+                if feeder.failed_frame is not None:
+                    self._save_capsule(feeder.node, feeder.failed_frame, feeder.error)
+        self.report.error = self.report.error or self.reader.error
         nothing = not (self.report.error or self.report.processed)
         if nothing and (last := self.last_failed):
             text = f"none of {self.report.failed} frames could be processed; the last: {last}"
