@@ -83,53 +83,29 @@ class Choice:
     withheld: Mapping[Reason, int]
 
 
-class _Table:
-    """The picks, and which of them have an orientation."""
-
-    def __init__(self, picks: Picks) -> None:
-        self.frame = picks.frame_id
-        self.id = picks.id
-        self.position = picks.position
-        self.axis = picks.axis
-        self.quaternion = picks.quaternion
-        self.diameter = picks.diameter
-        self.score = picks.score
-        self.sigma_position = picks.sigma_position
-        self.sigma_diameter = picks.sigma_diameter
-        self.sigma_tilt = picks.sigma_tilt
-        self.source = picks.source
-        self.flags = picks.flags
-        finite = np.isfinite(self.quaternion).all(axis=1) & np.isfinite(self.axis).all(axis=1)
-        self.oriented = finite & ((self.flags & PickFlag.POSE_UNKNOWN) == 0)
-
-
 class Filter:
     """Turns picks into targets."""
 
-    def __init__(
-        self,
-        allow_estimated: bool = False,
-        workspace: Workspace | None = None,
-    ) -> None:
+    def __init__(self, allow_estimated: bool = False, workspace: Workspace | None = None) -> None:
         self._allow_estimated = allow_estimated
         self._workspace = workspace
 
     def __call__(self, picks: Picks) -> Choice:
         """Return what may be sent of one frame's picks."""
-        table = _Table(picks)
+        oriented = _oriented(picks)
         with np.errstate(all="ignore"):
-            left, withheld = self._sieve(table)
-            return Choice(table.frame, _targets(table, left), withheld)
+            left, withheld = self._sieve(picks, oriented)
+            return Choice(picks.frame_id, _targets(picks, oriented, left), withheld)
 
-    def _sieve(self, table: _Table) -> tuple[NDArray[np.intp], dict[Reason, int]]:
+    def _sieve(self, picks: Picks, oriented: Bools) -> tuple[NDArray[np.intp], dict[Reason, int]]:
         bad: dict[Reason, Bools] = {
-            "no_depth": _no_depth(table),
-            "estimated": _estimated(table) & (not self._allow_estimated),
-            "invalid": ~_valid(table),
+            "no_depth": _no_depth(picks),
+            "estimated": _estimated(picks) & (not self._allow_estimated),
+            "invalid": ~_valid(picks, oriented),
         }
         if self._workspace is not None:
-            bad["workspace"] = ~self._workspace.contains(table.position)
-        left = np.ones(len(table.id), bool)
+            bad["workspace"] = ~self._workspace.contains(picks.position)
+        left = np.ones(len(picks), bool)
         withheld: dict[Reason, int] = dict.fromkeys(REASONS, 0)
         for reason, rows in bad.items():
             withheld[reason] = int((left & rows).sum())
@@ -137,32 +113,38 @@ class Filter:
         return np.flatnonzero(left), withheld
 
 
-def _no_depth(table: _Table) -> Bools:
-    flagged = (table.flags & PickFlag.DEPTH_MISSING) != 0
-    return np.asarray(flagged | (table.source == DepthSource.MISSING))
+def _oriented(picks: Picks) -> Bools:
+    """Return which picks (N,) have an orientation."""
+    finite = np.isfinite(picks.quaternion).all(axis=1) & np.isfinite(picks.axis).all(axis=1)
+    return np.asarray(finite & ((picks.flags & PickFlag.POSE_UNKNOWN) == 0))
 
 
-def _estimated(table: _Table) -> Bools:
+def _no_depth(picks: Picks) -> Bools:
+    flagged = (picks.flags & PickFlag.DEPTH_MISSING) != 0
+    return np.asarray(flagged | (picks.source == DepthSource.MISSING))
+
+
+def _estimated(picks: Picks) -> Bools:
     # Anything but a measurement is a guess, whether or not its producer set the flag.
-    flagged = (table.flags & PickFlag.DEPTH_ESTIMATED) != 0
-    return np.asarray(flagged | (table.source != DepthSource.MEASURED))
+    flagged = (picks.flags & PickFlag.DEPTH_ESTIMATED) != 0
+    return np.asarray(flagged | (picks.source != DepthSource.MEASURED))
 
 
-def _valid(table: _Table) -> Bools:
+def _valid(picks: Picks, oriented: Bools) -> Bools:
     # A sigma that is infinite says the measurement failed; NaN only that nobody estimated it.
-    sigmas = np.column_stack([table.sigma_position, table.sigma_diameter, table.sigma_tilt])
+    sigmas = np.column_stack([picks.sigma_position, picks.sigma_diameter, picks.sigma_tilt])
     good = ~(np.isinf(sigmas) | (sigmas < 0)).any(axis=1)
-    good &= (np.abs(table.position) <= FARTHEST_M).all(axis=1)
-    good &= (table.score >= 0) & (table.score <= 1)
-    good &= (table.id >= 0) & (table.id < ID_LIMIT)
-    sized = (table.diameter >= SMALLEST_M) & (table.diameter <= FARTHEST_M)
-    good &= sized | np.isnan(table.diameter)
-    for direction in (table.quaternion, table.axis):
+    good &= (np.abs(picks.position) <= FARTHEST_M).all(axis=1)
+    good &= (picks.score >= 0) & (picks.score <= 1)
+    good &= (picks.id >= 0) & (picks.id < ID_LIMIT)
+    sized = (picks.diameter >= SMALLEST_M) & (picks.diameter <= FARTHEST_M)
+    good &= sized | np.isnan(picks.diameter)
+    for direction in (picks.quaternion, picks.axis):
         unit = np.abs(np.linalg.norm(direction, axis=1) - 1) <= UNIT_TOLERANCE
-        good &= unit | ~table.oriented
+        good &= unit | ~oriented
     # A robot may go by either.
-    away = np.abs(axis_from_quaternion(table.quaternion) - table.axis).max(axis=1)
-    good &= (away <= AXIS_TOLERANCE) | ~table.oriented
+    away = np.abs(axis_from_quaternion(picks.quaternion) - picks.axis).max(axis=1)
+    good &= (away <= AXIS_TOLERANCE) | ~oriented
     return np.asarray(good)
 
 
@@ -174,26 +156,25 @@ def _unit(rows: Floats) -> list[list[float]]:
     return units
 
 
-def _targets(table: _Table, rows: NDArray[np.intp]) -> tuple[Target, ...]:
+def _targets(picks: Picks, oriented: Bools, rows: NDArray[np.intp]) -> tuple[Target, ...]:
     """Encode rows; a micrometre and a millionth are finer than any camera."""
-    position = np.round(table.position, 6).tolist()
-    quaternion, approach = _unit(table.quaternion), _unit(-table.axis)
-    diameter = np.round(table.diameter, 6).tolist()
-    score = np.round(table.score, 4).tolist()
-    spread = np.round(table.sigma_position, 6).tolist()
-    unsure = np.asarray(np.isnan(table.sigma_position).any(axis=1))
-    size_spread = np.round(table.sigma_diameter, 6).tolist()
-    tilt = np.round(table.sigma_tilt, 6).tolist()
+    position = np.round(picks.position, 6).tolist()
+    quaternion, approach = _unit(picks.quaternion), _unit(-picks.axis)
+    diameter = np.round(picks.diameter, 6).tolist()
+    score = np.round(picks.score, 4).tolist()
+    spread = np.round(picks.sigma_position, 6).tolist()
+    unsure = np.asarray(np.isnan(picks.sigma_position).any(axis=1))
+    size_spread = np.round(picks.sigma_diameter, 6).tolist()
+    tilt = np.round(picks.sigma_tilt, 6).tolist()
     found = []
     for i in rows.tolist():
-        oriented = bool(table.oriented[i])
-        flags = int(table.flags[i]) | (0 if oriented else int(PickFlag.POSE_UNKNOWN))
+        flags = int(picks.flags[i]) | (0 if oriented[i] else int(PickFlag.POSE_UNKNOWN))
         # orjson writes NaN as null, which is what these fields mean by it.
         content: dict[str, Any] = {
-            "id": f"m{table.id[i]}",
+            "id": f"m{picks.id[i]}",
             "position": position[i],
-            "orientation": quaternion[i] if oriented else None,
-            "approach": approach[i] if oriented else None,
+            "orientation": quaternion[i] if oriented[i] else None,
+            "approach": approach[i] if oriented[i] else None,
             "diameter": diameter[i],
             "score": score[i],
             "sigma": {
@@ -201,12 +182,12 @@ def _targets(table: _Table, rows: NDArray[np.intp]) -> tuple[Target, ...]:
                 "diameter": size_spread[i],
                 "tilt": tilt[i],
             },
-            "depth": _SOURCES[int(table.source[i])],
+            "depth": _SOURCES[int(picks.source[i])],
             "flags": [name for bit, name in _FLAGS if bit & flags],
         }
-        pose = quaternion[i] if oriented else (0.0,) * 4
+        pose = quaternion[i] if oriented[i] else (0.0,) * 4
         size = diameter[i] if diameter[i] == diameter[i] else 0.0
         found.append(
-            Target(int(table.id[i]), orjson.dumps(content), (*position[i], *pose, size), flags)
+            Target(int(picks.id[i]), orjson.dumps(content), (*position[i], *pose, size), flags)
         )
     return tuple(found)
