@@ -6,6 +6,7 @@ import json
 import math
 import sys
 import time
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -35,6 +36,23 @@ class Outcome(StrEnum):
     rejected = "rejected"
     done = "done"
     failed = "failed"
+
+
+@dataclass
+class _Talk:
+    """What `mushpipe robot client` was asked for, and how many messages it has shown so far."""
+
+    mode: Mode
+    asked: dict[str, int]
+    every: float
+    ack: list[Outcome]
+    raw: bool
+    count: int
+    shown: int = 0
+
+    def over(self) -> bool:
+        """Whether all messages were shown; a count of 0 is for ever."""
+        return 0 < self.count <= self.shown
 
 
 class _NobodyReads(Exception):  # noqa: N818 - no fault: `| head`
@@ -82,6 +100,8 @@ def client(
     raw: Annotated[bool, typer.Option("--raw", help="print the lines as they come")] = False,
 ) -> None:
     """Print targets and acknowledge them, reconnecting when the server goes away."""
+    from mushpipe.robot.client import RobotClient
+
     host, port = _split(address)
     if mode is Mode.stream and (most is not None or max_age_ms is not None):
         raise typer.BadParameter("--max and --max-age-ms go with --mode request")
@@ -90,11 +110,13 @@ def client(
         hello["token"] = token_file.read_text().strip()
     if tls_ca is not None:
         hello["tls"] = _trust(tls_ca)
-    shown = [0]  # over all connections
-    wishes = (10 if most is None else most, max_age_ms, every, ack or [])
-    while not count or shown[0] < count:
+    asked = {"max": 10 if most is None else most}
+    asked |= {} if max_age_ms is None else {"max_age_ms": max_age_ms}
+    talk = _Talk(mode, asked, every, ack or [], raw, count)
+    while not talk.over():
         try:
-            _talk(host, port, mode, hello, wishes, (shown, count), raw)
+            with RobotClient(host, port, mode, **hello) as connection:
+                _converse(connection, talk)
         except _NobodyReads as error:
             raise BrokenPipeError from error
         except PermissionError as error:
@@ -105,42 +127,30 @@ def client(
             time.sleep(1.0)
 
 
-def _talk(
-    host: str,
-    port: int,
-    mode: Mode,
-    hello: dict[str, Any],
-    wishes: tuple[int, int | None, float, list[Outcome]],
-    counts: tuple[list[int], int],
-    raw: bool,
-) -> None:
+def _converse(connection: RobotClient, talk: _Talk) -> None:
     """Hold one conversation, and count the messages that are shown."""
-    from mushpipe.robot.client import RobotClient
-
-    most, max_age_ms, every, ack = wishes
-    asked = {"max": most} | ({} if max_age_ms is None else {"max_age_ms": max_age_ms})
-    shown, count = counts
-    with RobotClient(host, port, mode, **hello) as connection:
-        _note(f"connected: {connection.hello['software']}")
-        while not count or shown[0] < count:
-            if mode is Mode.stream:
-                message = connection.receive()
-                if message["op"] == "heartbeat":
-                    connection.ping()
-                elif message["op"] == "pong":
-                    continue
-            else:
-                message = connection.ask("get_targets", **asked)
-            _show(message, raw)
-            if connection.late_ms > message.get("valid_ms", math.inf):
-                _note(f"{connection.late_ms:.0f} ms late on the way: no longer valid")
-                message["targets"] = []
-            shown[0] += message["op"] != "heartbeat"
-            if message["op"] == "bye":
-                raise ConnectionError(f"the server says bye: {message['reason']}")
-            _acknowledge(connection, message, ack, raw)
-            if mode is Mode.request and (not count or shown[0] < count):
-                time.sleep(every)
+    _note(f"connected: {connection.hello['software']}")
+    while not talk.over():
+        if talk.mode is Mode.stream:
+            message = connection.receive()
+            if message["op"] == "heartbeat":
+                connection.ping()
+            elif message["op"] == "pong":
+                continue
+        else:
+            message = connection.ask("get_targets", **talk.asked)
+        _show(message, talk.raw)
+        if connection.late_ms > message.get("valid_ms", math.inf):
+            _note(f"{connection.late_ms:.0f} ms late on the way: no longer valid")
+            message["targets"] = []
+        talk.shown += message["op"] != "heartbeat"
+        if message["op"] == "bye":
+            raise ConnectionError(f"the server says bye: {message['reason']}")
+        for outcome in talk.ack if message.get("targets") else []:
+            target = message["targets"][0]["id"]
+            _show(connection.ask("ack", target=target, result=outcome.value), talk.raw)
+        if talk.mode is Mode.request and not talk.over():
+            time.sleep(talk.every)
 
 
 def _trust(path: Path) -> ssl.SSLContext:
@@ -151,14 +161,6 @@ def _trust(path: Path) -> ssl.SSLContext:
     except OSError as error:
         why = error.strerror or "it holds no certificate in PEM"
         raise typer.BadParameter(f"--tls-ca {path}: {why}") from error
-
-
-def _acknowledge(
-    connection: RobotClient, message: dict[str, Any], ack: list[Outcome], raw: bool
-) -> None:
-    for outcome in ack if message.get("targets") else []:
-        target = message["targets"][0]["id"]
-        _show(connection.ask("ack", target=target, result=outcome.value), raw)
 
 
 def _show(message: dict[str, Any], raw: bool) -> None:

@@ -77,7 +77,7 @@ class RobotServer:
         except BaseException:
             self._release()
             raise
-        self._ports = tuple(sock.getsockname()[1] for sock in self._sockets)
+        self.ports = tuple(sock.getsockname()[1] for sock in self._sockets)  # as its listeners
         self._thread = threading.Thread(target=self._run, name="mushpipe-robot", daemon=True)
 
     def _listen(self, listener: Listener) -> None:
@@ -97,11 +97,6 @@ class RobotServer:
             ) from error
         sock.setblocking(False)
         self._selector.register(sock, selectors.EVENT_READ, listener)
-
-    @property
-    def ports(self) -> tuple[int, ...]:
-        """Return the ports it listens on, in the order of its listeners."""
-        return self._ports
 
     def start(self) -> None:
         """Begin to serve."""
