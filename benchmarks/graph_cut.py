@@ -11,12 +11,13 @@ import maxflow
 import numpy as np
 from numpy.typing import NDArray
 
+ROUNDS = 4  # of alternation, at most
 AXIAL = np.array([[0, 0, 0], [0, 0, 1], [0, 1, 0]])
 DIAGONAL = np.array([[0, 0, 0], [0, 0, 0], [1, 0, 1]])
 
 
 def graph_cut(
-    gray: NDArray[np.float32], initial: NDArray[np.bool_], mu: float, rounds: int = 4
+    gray: NDArray[np.float32], initial: NDArray[np.bool_], mu: float
 ) -> NDArray[np.bool_]:
     """Return the region of least energy, alternating with its means from an initial region on.
 
@@ -24,10 +25,9 @@ def graph_cut(
         gray: (H, W) in 0..1.
         initial: (H, W).
         mu: Weight of the length.
-        rounds: Most rounds of alternation.
     """
     region = initial
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         if region.all() or not region.any():
             break
         c1, c2 = gray[region].mean(), gray[~region].mean()

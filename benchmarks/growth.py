@@ -10,7 +10,6 @@ The exponent is the slope of log(time) over log(size): 1 is linear.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 from typing import cast
@@ -51,11 +50,9 @@ def measure(folder: Path, frames: int, **scene: int) -> dict[str, float]:
     return stage_times(GRAPH, recording(folder, **scene), frames)
 
 
-def stage_times(
-    graph: Path, path: Path, frames: int, overrides: Sequence[str] = ()
-) -> dict[str, float]:
+def stage_times(graph: Path, path: Path, frames: int) -> dict[str, float]:
     """Return the median time of each stage, of passes of one frame one by one, ms."""
-    plan = compile_document(read_document(graph), load_registry(), overrides, str(path)).fresh()
+    plan = compile_document(read_document(graph), load_registry(), source=str(path)).fresh()
     source = cast(Source, plan.source.plugin)
     frame = next(source.frames())
     for node in plan.stages:

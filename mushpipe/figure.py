@@ -22,10 +22,11 @@ if TYPE_CHECKING:
     from mushpipe.stages.registration import Alignment
 
 T = TypeVar("T")
-GREEN, RED, BLUE, YELLOW = "#28c840", "#e02020", "#1440e0", "#ffd000"
+GREEN, RED, BLUE = "#28c840", "#e02020", "#1440e0"
 PANEL_IN = 4.6  # width of an image
 DPI = 150
 FONT = 6  # points
+POSES = 3  # mushrooms
 
 
 class Panel(NamedTuple):
@@ -101,13 +102,12 @@ def draw_diameter(trace: Trace) -> Figure:
     return _lay_out([Panel("diameter, mm", trace.frame.color, draw)], columns=1, scale=1.9)
 
 
-def draw_pose(trace: Trace, settings: Mapping[str, Any], most: int = 3) -> Figure:
+def draw_pose(trace: Trace, settings: Mapping[str, Any]) -> Figure:
     """Draw the model (red) and the sample (blue) before and after registration, seen from the side.
 
     Args:
         trace: The frame.
         settings: Of the stage `registration`, which is run anew on the best circles.
-        most: How many mushrooms.
 
     Raises:
         UsageError: The frame has no circles, no locations, or no mushroom with enough depth.
@@ -122,7 +122,7 @@ def draw_pose(trace: Trace, settings: Mapping[str, Any], most: int = 3) -> Figur
     frame = ([trace.frame] + [value for _, value in _named(trace, RgbdFrame)])[-1]
     tries = (stage.align(frame, circles, locations, int(row), 0) for row in best)
     pairs = zip(best, tries, strict=True)
-    found = list(islice((pair for pair in pairs if pair[1] is not None), most))
+    found = list(islice((pair for pair in pairs if pair[1] is not None), POSES))
     if not found:
         raise UsageError(f"frame {trace.frame.header.sequence}: no mushroom has enough depth")
     return _lay_out_clouds([alignment for _, alignment in found if alignment is not None])

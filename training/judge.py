@@ -25,6 +25,7 @@ from training.verifier import RADII, segmentations
 
 PAPER = (8.0, 38.0)  # px
 BEDS = ("even", "gradient", "dense", "brown", "tilted")
+BINS = 5  # of the score, for `reliability`
 LEAST = 0.2  # score of what `cap-fit` decides about, as in the graphs
 
 
@@ -140,12 +141,12 @@ def errors(score: Score) -> str:
     )
 
 
-def reliability(score: Score, bins: int = 5) -> str:
+def reliability(score: Score) -> str:
     """Return mean score and share of right circles per bin of the score."""
     values = np.array(score.reliability)
     lines = []
-    for low in np.linspace(0.5, 1, bins, endpoint=False):
-        part = values[(values[:, 0] >= low) & (values[:, 0] < low + 0.5 / bins + 1e-9)]
+    for low in np.linspace(0.5, 1, BINS, endpoint=False):
+        part = values[(values[:, 0] >= low) & (values[:, 0] < low + 0.5 / BINS + 1e-9)]
         if len(part):
             score, right = part.mean(axis=0)
             lines.append(f"  score {score:.2f}: right {right:.2f} of {len(part)}")

@@ -52,7 +52,7 @@ class DependencyError(MushpipeError):
 class StageError(MushpipeError):
     """A stage, source or sink failed on a frame."""
 
-    def __init__(self, message: str, exit_code: int = EXIT_FAILED) -> None:
+    def __init__(self, message: str, exit_code: int) -> None:
         super().__init__(message)
         self.exit_code = exit_code
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 COEFFICIENTS = {"none": 0, "brown_conrady": 5, "inverse_brown_conrady": 5, "rational": 8}
 _FORWARD = ("brown_conrady", "rational")
+_ROUNDS = 60  # of Gauss-Newton, at most
 
 
 def brown(xy: Array, coefficients: tuple[float, ...]) -> Array:
@@ -47,7 +48,7 @@ def brown(xy: Array, coefficients: tuple[float, ...]) -> Array:
     )
 
 
-def brown_inverse(xy: Array, coefficients: tuple[float, ...], iterations: int = 60) -> Array:
+def brown_inverse(xy: Array, coefficients: tuple[float, ...]) -> Array:
     """Undo `brown` by Gauss-Newton with a numeric Jacobian.
 
     Points where no pre-image is found to 1e-7 become NaN, and so do pre-images beyond the fold of
@@ -59,7 +60,7 @@ def brown_inverse(xy: Array, coefficients: tuple[float, ...], iterations: int = 
     with np.errstate(all="ignore"):
         # A wide lens ends inside the image, and of what lies beyond nothing would converge.
         left = np.flatnonzero(~(np.hypot(*wanted.T) > _farthest_image(coefficients, fold)))
-        for _ in range(iterations):
+        for _ in range(_ROUNDS):
             now = guess[left]
             error = brown(now, coefficients) - wanted[left]
             going = np.abs(error).max(axis=-1) >= 1e-12

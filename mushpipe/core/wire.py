@@ -7,7 +7,7 @@ by a JSON Schema in the file, so that any MCAP tool can read it.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -272,7 +272,6 @@ class Decoded:
 
     header: Header
     table: Columns
-    topic: str = field(default="")
 
 
 def decode_table(schema_name: str, data: bytes, log_time: int = 0) -> Decoded | None:

@@ -14,7 +14,7 @@ from mushpipe.evaluate import statistics
 from mushpipe.evaluate.metrics import Value
 from mushpipe.evaluate.thresholds import Outcome, check, parse_threshold, require_known
 
-WINDOW = 31
+WINDOW = 31  # px
 FARTHEST_OFF = 0.2  # share of the distance; the SR300 is off by 1 %
 PLANE_METRICS = ("mean_mm", "std_mm", "range_mm", "offset_mm", "flat_std_mm", "valid")
 
@@ -29,12 +29,12 @@ class PlaneRow:
     values: dict[str, Value]
 
 
-def window_of(depth_m: NDArray[np.float32], size: int = WINDOW) -> Floats:
-    """Return the central (size, size) window of a depth image, in mm; NaN = missing."""
-    top, left = ((length - size) // 2 for length in depth_m.shape)
+def window_of(depth_m: NDArray[np.float32]) -> Floats:
+    """Return the central (WINDOW, WINDOW) window of a depth image, in mm; NaN = missing."""
+    top, left = ((length - WINDOW) // 2 for length in depth_m.shape)
     if min(top, left) < 0:
-        raise InputError(f"the depth image is smaller than the window of {size}x{size} px")
-    return 1e3 * depth_m[top : top + size, left : left + size].astype(float)
+        raise InputError(f"the depth image is smaller than the window of {WINDOW}x{WINDOW} px")
+    return 1e3 * depth_m[top : top + WINDOW, left : left + WINDOW].astype(float)
 
 
 def plane_values(window: Floats, distance_m: float) -> dict[str, float]:
@@ -73,7 +73,7 @@ def _flat_std(window: Floats) -> float:
 
 
 def measure_plane(
-    recording: Path, distance_m: float, window: int = WINDOW, resamples: int = 1000, seed: int = 0
+    recording: Path, distance_m: float, resamples: int = 1000, seed: int = 0
 ) -> PlaneRow:
     """Measure the depth of a recording against a plane at a known distance.
 
@@ -84,7 +84,7 @@ def measure_plane(
     from mushpipe.sources.mcap import McapSource
 
     frames = [
-        plane_values(window_of(frame.depth_m, window), distance_m)
+        plane_values(window_of(frame.depth_m), distance_m)
         for frame in McapSource(path=recording).frames()
         if frame.depth is not None
     ]
@@ -131,7 +131,7 @@ def judge_planes(
     require_known(bounds, PLANE_METRICS)
     truths = _distances(distances, len(recordings))
     rows = [
-        measure_plane(path, truth, WINDOW, resamples, seed)
+        measure_plane(path, truth, resamples, seed)
         for path, truth in zip(recordings, truths, strict=True)
     ]
     outcomes = [

@@ -18,6 +18,7 @@ from mushpipe.sim.render import Surface, is_mushroom
 from mushpipe.sim.settings import SceneSettings
 from mushpipe.sim.world import World
 
+_RAYS = 10  # to the sky, per vertex
 _REACH = 0.15  # m; what stands farther away shades nothing of the sky
 _PANEL = 2.5  # how much brighter the sky is overhead: it is a panel of lamps, not a dome
 _LIFT = 0.0004  # m; shadow rays start so far above their surface
@@ -82,7 +83,7 @@ def rig_for(settings: SceneSettings, rng: np.random.Generator) -> Rig:
     return Rig(0.64, (_lamp(rng, front, 0.08, 0.40, 2),))
 
 
-def ambient(world: World, surface: Surface, rng: np.random.Generator, count: int = 10) -> Singles:
+def ambient(world: World, surface: Surface, rng: np.random.Generator) -> Singles:
     """Return the share of the sky's light that reaches each vertex (V,) of the world in view.
 
     Rays are cosine-distributed, turned differently at each vertex, and the result is averaged
@@ -98,8 +99,8 @@ def ambient(world: World, surface: Surface, rng: np.random.Generator, count: int
     normal = world.normals[rows]
     origin = world.vertices[rows] + _LIFT * normal
     total, weight = np.zeros(len(rows), np.float32), 0.0
-    for k in range(count):
-        out = np.sqrt((k + 0.5) / count)  # Malley: even on the disc is cosine on the sphere
+    for k in range(_RAYS):
+        out = np.sqrt((k + 0.5) / _RAYS)  # Malley: even on the disc is cosine on the sphere
         direction = _around(normal, turn + k * 2.399963, out)
         free = ~world.caster.blocked(rays(origin, direction), _REACH)
         total += np.clip(direction[:, 2], 0, 1) ** _PANEL * free

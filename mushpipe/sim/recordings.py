@@ -57,7 +57,7 @@ class Definition:
         return path
 
 
-def definitions(table: Path = TABLE) -> dict[str, Definition]:
+def definitions(table: Path) -> dict[str, Definition]:
     """Read the table: name -> definition, in the table's order.
 
     Raises:

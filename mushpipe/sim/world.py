@@ -64,8 +64,8 @@ class View:
     rotation: Floats
     position: Floats
 
-    def directions(self, pixels: Floats | None = None) -> Floats:
-        """Return directions (P, 3) through pixels (P, 2), by default all, of length 1 along z."""
+    def directions(self, pixels: Floats | None) -> Floats:
+        """Return directions (P, 3) through pixels (P, 2), all where None, of length 1 along z."""
         if pixels is None:
             v, u = np.mgrid[: self.camera.height, : self.camera.width].reshape(2, -1)
             pixels = np.stack([u, v], axis=-1).astype(np.float64)

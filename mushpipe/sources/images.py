@@ -40,11 +40,6 @@ _FISHEYE = ("equidistant", "kannala_brandt", "fisheye")
 _PNG = b"\x89PNG"
 
 
-def is_depth_encoding(encoding: str) -> bool:
-    """Return whether an image of this encoding can be depth."""
-    return encoding in _DEPTH
-
-
 def _pixels(message: Any, item: int) -> NDArray[np.uint8]:
     """Return the image's bytes as (H, W * item), without the padding at the end of its rows."""
     height, width, step = message.height, message.width, message.step or message.width * item
@@ -151,7 +146,7 @@ def distortion(message: Any) -> list[float]:
     return [float(v) for v in (message.d if hasattr(message, "d") else message.D)]
 
 
-def decode_camera(message: Any, rectified: bool = False) -> Camera | None:
+def decode_camera(message: Any, rectified: bool) -> Camera | None:
     """Decode CameraInfo or CameraCalibration; None where it says that it is not calibrated.
 
     Args:

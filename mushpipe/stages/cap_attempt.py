@@ -107,7 +107,7 @@ def gather(
         turn = COMPASS[j * (DIRECTIONS // ROUND)]
         x, y = circle[0] + circle[2] * turn[0], circle[1] + circle[2] * turn[1]
         touch(rays, j, place(image[1], focal, x, y), 0.0, 0.0)
-    normalise(rays, 0, ROUND + n + m)
+    normalise(rays, ROUND + n + m)
     return n, other, m, middle - sensor[2]
 
 

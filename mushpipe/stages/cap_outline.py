@@ -250,5 +250,5 @@ def sample_outline(
         x, y = circle[0] + reach * COMPASS[j, 0], circle[1] + reach * COMPASS[j, 1]
         touch(out, n, place(rays, focal, x, y), sigma * cap[2] / focal, EDGE_SHARE)
         n += 1
-    normalise(out, 0, n)
+    normalise(out, n)
     return n

@@ -252,18 +252,13 @@ def touch(out: Singles, n: int, at: tuple[float, float], sigma: float, share: fl
 
 
 @borrower
-def normalise(rays: Singles, first: int, last: int) -> None:
-    """Make unit rays of columns (6, M) that hold rays at z = 1, depths and their sigmas.
+def normalise(rays: Singles, count: int) -> None:
+    """Make unit rays of the first columns (6, M) that hold rays at z = 1, depths and their sigmas.
 
     Ranges and their sigmas take the place of depths; rays that touch keep what they have.
-
-    Args:
-        rays: In and out.
-        first: Number of the first column.
-        last: Past the last.
     """
     one, none = Single(1), Single(0)
-    for j in range(first, last):
+    for j in range(count):
         length = np.sqrt(one + rays[0, j] * rays[0, j] + rays[1, j] * rays[1, j])
         short = one / length
         rays[4, j] *= length if rays[3, j] > none else one

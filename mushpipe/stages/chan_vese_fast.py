@@ -27,6 +27,10 @@ Planes = NDArray[np.float32]
 Bits = NDArray[np.uint8]  # 1 inside, 0 outside; a quarter of the memory that floats would need
 Levels = tuple[float, float]
 SIGMA = 1.5
+DEPTH = 5  # levels of the pyramid, the full resolution among them
+# Most ICTM iterations and sweeps of descent at full resolution, fewer where nothing moves any more;
+# each coarser level takes twice the iterations and four times the sweeps.
+ITERATIONS, SWEEPS = 3, 2
 _TAPS = np.exp(-(np.arange(-3, 4) ** 2) / (2 * SIGMA**2)).astype(np.float32)
 _TAPS /= _TAPS.sum()
 
@@ -205,9 +209,6 @@ def solve_fast(
     initial: NDArray[np.bool_],
     mu: float,
     levels: Levels | None = None,
-    depth: int = 5,
-    iterations: int = 3,
-    sweeps: int = 2,
 ) -> NDArray[np.bool_]:
     """Minimise the Chan-Vese energy from an initial region.
 
@@ -216,15 +217,11 @@ def solve_fast(
         initial: (H, W) region to start from.
         mu: Weight of the length.
         levels: c1 and c2 where they are known; else they are the means of the two sides.
-        depth: Levels of the pyramid, the full resolution among them.
-        iterations: Most ICTM iterations at full resolution, doubled per level; fewer where nothing
-            moves any more.
-        sweeps: Most sweeps of descent at full resolution, four times more per level.
     """
     # A copy: read-only planes would be a type of their own to the compiler.
     planes = np.stack(cv2.split(image)) if image.ndim == 3 else image[None].copy()
     bits = initial.view(np.uint8)
-    return _pyramid(planes, bits, mu, levels, depth, iterations, sweeps).view(np.bool_)
+    return _pyramid(planes, bits, mu, levels, DEPTH, ITERATIONS, SWEEPS).view(np.bool_)
 
 
 def _pyramid(

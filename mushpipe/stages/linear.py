@@ -14,28 +14,25 @@ from mushpipe.core.jit import borrower, jit
 Floats = NDArray[np.float64]
 
 
-def least_squares(columns: Floats, target: Floats, weight: Floats | None = None) -> Floats:
-    """Solve min sum w (columns x - target)^2 by the normal equations.
+def least_squares(columns: Floats, target: Floats) -> Floats:
+    """Solve min |columns x - target|^2 by the normal equations.
 
     Args:
         columns: (M, K) with small K and entries of about 1: the equations square the condition.
         target: (M,).
-        weight: (M,) or None for 1.
 
     Returns:
         (K,) the solution; of least norm where the columns do not determine it.
     """
-    share = np.ones(len(target)) if weight is None else weight
     # copies: of one type whatever is given, so that the kernel is compiled once
-    normal, right = normal_equations(
-        *(np.array(part, np.float64, order="C") for part in (columns, target, share))
-    )
+    basis, values = (np.array(part, np.float64, order="C") for part in (columns, target))
+    normal, right = normal_equations(basis, values, np.ones(len(values)))
     return np.asarray(np.linalg.lstsq(normal, right)[0])
 
 
 @jit
 def normal_equations(columns: Floats, target: Floats, weight: Floats) -> tuple[Floats, Floats]:
-    """Return the matrix (K, K) and the right side (K,) of `least_squares`."""
+    """Return the matrix (K, K) and the right side (K,), each of M rows with its weight."""
     size = columns.shape[1]
     normal, right = np.zeros((size, size)), np.zeros(size)
     for m in range(len(target)):

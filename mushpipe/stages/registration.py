@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field, PrivateAttr
+from pydantic import Field, PrivateAttr
 
 from mushpipe import (
     Circles,
@@ -58,8 +58,6 @@ class Registration(Stage):
     ICP; the pose is the turn that takes the upright model to the mushroom, without its spin. The
     tilt's sigma is unknown. `cap-fit` is better and far faster; this is for comparison.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     model: Literal["mushroom", "cap"] | GraphPath = Field(
         "mushroom", description="the project's mushroom, its cap alone, or a mesh or cloud, z up"
