@@ -143,7 +143,7 @@ def test_an_axis_that_is_flipped_is_in_the_plot_of_axis_errors() -> None:
         at = header(number)
         known = FrameTruth(truth, frame_id=FRAME)
         verdicts.append(judge("bed", ("stamp_ns", at.stamp_ns), known, at, found))
-    figure, *_ = _against_tilt(events_of(verdicts))
+    figure = _against_tilt(events_of(verdicts))
     assert figure is not None
     (axes,) = figure.axes
     error = np.asarray(axes.lines[0].get_ydata())
