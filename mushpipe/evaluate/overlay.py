@@ -13,13 +13,14 @@ import numpy as np
 from mushpipe.core.errors import MushpipeError
 from mushpipe.core.recording import RecordingReader
 from mushpipe.core.types import RgbdFrame
-from mushpipe.core.wire import COLOR_TOPIC
+from mushpipe.core.wire import COLOR_TOPIC, jpeg
 from mushpipe.evaluate.events import Verdict
 from mushpipe.evaluate.judging import Judged
 from mushpipe.evaluate.truth import Place
 from mushpipe.traces import source_recording
 
 logger = logging.getLogger("mushpipe")
+_JPEG_QUALITY = 82
 
 
 def worst(verdicts: Sequence[Verdict], most: int) -> list[Verdict]:
@@ -69,9 +70,9 @@ def overlay(verdict: Verdict, frame: RgbdFrame | None) -> str:
         picture = ""
     else:
         height, width = frame.color.shape[:2]
-        picture = (
-            f'<image x="-0.5" y="-0.5" width="{width}" height="{height}" href="{_jpeg(frame)}"/>'
-        )
+        data = base64.b64encode(jpeg(frame.color, _JPEG_QUALITY)).decode()
+        href = f"data:image/jpeg;base64,{data}"
+        picture = f'<image x="-0.5" y="-0.5" width="{width}" height="{height}" href="{href}"/>'
     size = f'viewBox="-0.5 -0.5 {width} {height}" xmlns="http://www.w3.org/2000/svg"'
     return f'<svg {size} role="img">{picture}{"".join(_circles(verdict))}</svg>'
 
@@ -80,13 +81,6 @@ def _extent(verdict: Verdict) -> tuple[int, int]:
     center = np.concatenate([verdict.truth.caps.center, verdict.detections.center, [[600, 440]]])
     width, height = center.max(axis=0) + 40
     return int(width), int(height)
-
-
-def _jpeg(frame: RgbdFrame) -> str:
-    import cv2
-
-    _, data = cv2.imencode(".jpg", frame.color[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 82])
-    return f"data:image/jpeg;base64,{base64.b64encode(data.tobytes()).decode()}"
 
 
 def _circles(verdict: Verdict) -> list[str]:

@@ -12,20 +12,19 @@ from mushpipe.core.types import RgbdFrame
 from mushpipe.evaluate.command import Comparison, Judgement, Section
 from mushpipe.evaluate.events import Verdict
 from mushpipe.evaluate.judging import Summary
-from mushpipe.evaluate.metrics import METRICS, Value
+from mushpipe.evaluate.metrics import Value
 from mushpipe.evaluate.overlay import images_of, overlay, worst
 from mushpipe.evaluate.plots import plots_of
 from mushpipe.evaluate.show import (
-    CARRIED,
     LABELS,
-    QUANTITIES,
-    STATED,
     comparison_title,
     digits_of,
+    error_rows,
     interval,
     known_values,
     notes_of,
     number,
+    stated_rows,
 )
 
 WORST = 6
@@ -114,9 +113,13 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]], total: bool = Fal
     )
 
 
+def _interval(value: Value, digits: int) -> str:
+    return interval(value, digits).replace("..", " … ")
+
+
 def _cell(name: str, value: Value) -> str:
     digits = digits_of(name)
-    below = interval(value, digits).replace("..", " … ")
+    below = _interval(value, digits)
     text = number(value.value, digits)
     return f'{text}<span class="interval">{below}</span>' if below else text
 
@@ -132,7 +135,7 @@ def _comparison(comparison: Comparison) -> str:
     rows = []
     for name, value in known_values(comparison):
         digits = digits_of(name) + 1
-        below = interval(value, digits).replace("..", " … ")
+        below = _interval(value, digits)
         sure = value.low > 0 or value.high < 0
         text = number(value.value, digits)
         rows.append([escape(name), f"<b>{text}</b>" if sure else text, below])
@@ -177,7 +180,7 @@ def _cards(summary: Summary) -> str:
         value = summary.values[name]
         if np.isfinite(value.value):
             digits = digits_of(name)
-            below = interval(value, digits).replace("..", " … ") or "&nbsp;"
+            below = _interval(value, digits) or "&nbsp;"
             text = f"{number(value.value, digits)}<small>{unit}</small>"
             cards.append(
                 f'<div class="card"><span>{title}</span><b>{text}</b><span>{below}</span></div>'
@@ -186,16 +189,10 @@ def _cards(summary: Summary) -> str:
 
 
 def _errors(summary: Summary) -> str:
-    rows = []
-    for quantity, title in QUANTITIES.items():
-        metrics = {m.label: name for name, m in METRICS.items() if m.quantity == quantity}
-        n = summary.values[next(iter(metrics.values()))].n
-        if n:
-            cells = [
-                _cell(metrics[label], summary.values[metrics[label]]) if label in metrics else ""
-                for label in LABELS
-            ]
-            rows.append([escape(title), str(n), *cells])
+    rows = [
+        [escape(title), str(n), *(_cell(*value) if value else "" for value in values)]
+        for title, n, values in error_rows(summary)
+    ]
     if not rows:
         return ""
     heading = "<h3>Errors of the mushrooms found, detected minus true</h3>"
@@ -203,10 +200,7 @@ def _errors(summary: Summary) -> str:
 
 
 def _stated(summary: Summary) -> str:
-    rows = []
-    for name in STATED:
-        keys = (f"coverage_{CARRIED[name]}", f"coverage_sigma_{name}", f"calibration_{name}")
-        rows.append([CARRIED[name], *(_cell(key, summary.values[key]) for key in keys)])
+    rows = [[name, *(_cell(*value) for value in values)] for name, values in stated_rows(summary)]
     heads = ["", "given", "sigma given", "mean squared z"]
     return "<h3>Coverage, and calibration of the stated sigmas</h3>" + table(heads, rows)
 

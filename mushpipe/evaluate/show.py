@@ -45,8 +45,10 @@ QUANTITIES = {
     "upright": "answer 'upright', deg",
     "tilt": "tilt, deg",
 }
-STATED = ("position", "diameter", "tilt")
+# for which sigmas are stated, each with what carries it
 CARRIED = {"position": "position", "diameter": "diameter", "tilt": "axis"}
+Named = tuple[str, Value]
+"""A value with the name of its metric."""
 
 
 def number(value: float, digits: int = 2) -> str:
@@ -64,6 +66,22 @@ def interval(value: Value, digits: int = 2) -> str:
 def digits_of(name: str) -> int:
     """Return how many digits of a metric mean something: 3 of ratios, 2 of lengths and angles."""
     return 2 if METRICS[name].unit else 3
+
+
+def error_rows(summary: Summary) -> Iterator[tuple[str, int, list[Named | None]]]:
+    """Yield title, number of mushrooms and statistics, by `LABELS`, of each error that is known."""
+    for quantity, title in QUANTITIES.items():
+        metrics = {m.label: name for name, m in METRICS.items() if m.quantity == quantity}
+        names = [metrics.get(label) for label in LABELS]
+        if n := summary.values[next(iter(metrics.values()))].n:
+            yield title, n, [(name, summary.values[name]) if name else None for name in names]
+
+
+def stated_rows(summary: Summary) -> Iterator[tuple[str, list[Named]]]:
+    """Yield what is given: how often it is, how often with a sigma, and how true sigmas are."""
+    for name, carrier in CARRIED.items():
+        keys = (f"coverage_{carrier}", f"coverage_sigma_{name}", f"calibration_{name}")
+        yield carrier, [(key, summary.values[key]) for key in keys]
 
 
 def cell(name: str, value: Value) -> Text:
@@ -154,15 +172,8 @@ def headline_table(first: str, rows: Sequence[tuple[str, Summary]]) -> Titled:
 def error_table(summary: Summary) -> Titled:
     """Every error of the mushrooms found, with its statistics."""
     result = Titled("Errors of the mushrooms found", "detected - true", ["n", *LABELS])
-    for quantity, title in QUANTITIES.items():
-        metrics = {m.label: name for name, m in METRICS.items() if m.quantity == quantity}
-        n = summary.values[next(iter(metrics.values()))].n
-        if n:
-            cells = [
-                cell(metrics[label], summary.values[metrics[label]]) if label in metrics else ""
-                for label in LABELS
-            ]
-            result.add_row(title, str(n), *cells)
+    for title, n, values in error_rows(summary):
+        result.add_row(title, str(n), *(cell(*value) if value else "" for value in values))
     return result
 
 
@@ -170,13 +181,8 @@ def stated_table(summary: Summary) -> Titled:
     """How often a value is given at all, and whether the sigmas stated with it are true."""
     columns = ["given", "sigma given", "mean squared z"]
     result = Titled("Coverage and stated sigmas (1 is calibrated)", "value", columns)
-    for name in STATED:
-        keys = (
-            f"coverage_{CARRIED[name]}",
-            f"coverage_sigma_{name}",
-            f"calibration_{name}",
-        )
-        result.add_row(CARRIED[name], *(cell(key, summary.values[key]) for key in keys))
+    for name, values in stated_rows(summary):
+        result.add_row(name, *(cell(*value) for value in values))
     return result
 
 
