@@ -62,25 +62,20 @@ class Columns:
     def __post_init__(self) -> None:
         length: int | None = None
         for name, (shape, dtype) in self._columns().items():
-            given = getattr(self, name)
+            given, where = getattr(self, name), f"{type(self).__name__}.{name}"
             array = locked(given, dtype)
             if dtype.kind in "biu" and not _as_given(array, given):
                 raise ValueError(
-                    f"{type(self).__name__}.{name} is declared {dtype}, and was given what that "
-                    "cannot hold"
+                    f"{where} is declared {dtype}, and was given what that cannot hold"
                 )
             if array.shape == (0,):  # an empty list, of which nothing tells the shape of a row
                 array = array.reshape(0, *shape)
             if array.shape[1:] != shape or array.ndim == 0:
                 expected = ", ".join(["N", *map(str, shape)])
-                raise ValueError(
-                    f"{type(self).__name__}.{name} has shape {array.shape}, "
-                    f"expected ({expected}{',' if not shape else ''})"
-                )
+                expected += "" if shape else ","
+                raise ValueError(f"{where} has shape {array.shape}, expected ({expected})")
             if length is not None and len(array) != length:
-                raise ValueError(
-                    f"{type(self).__name__}.{name} has {len(array)} rows, expected {length}"
-                )
+                raise ValueError(f"{where} has {len(array)} rows, expected {length}")
             length = len(array)
             object.__setattr__(self, name, array)
         self.check()
@@ -111,6 +106,11 @@ class Columns:
         """Return the given rows (indices or a mask), in that order."""
         taken = {name: getattr(self, name)[rows] for name in self._columns()}
         return replace(self, **taken)  # type: ignore[type-var]
+
+    def joined(self, other: Self) -> Self:
+        """Return these rows, and behind them those of another."""
+        both = {n: np.concatenate([getattr(self, n), getattr(other, n)]) for n in self._columns()}
+        return replace(self, **both)  # type: ignore[type-var]
 
     def __len__(self) -> int:
         return len(getattr(self, next(iter(self._columns()))))

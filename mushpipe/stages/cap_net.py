@@ -131,13 +131,8 @@ class CapNet(Stage):
         """Return the circles of two scales; of a fine one within a surer coarse one nothing."""
         away = np.linalg.norm(fine.center[:, None] - coarse.center, axis=2)
         within = (away < coarse.radius) & (fine.score[:, None] <= coarse.score)
-        parts = (coarse, fine.take(~within.any(axis=1)))
-        center, radius, score = (
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ("center", "radius", "score")
-        )
-        first = np.argsort(-score, kind="stable")
-        every = Circles(center[first], radius[first], score[first])
+        every = coarse.joined(fine.take(~within.any(axis=1)))
+        every = every.take(np.argsort(-every.score, kind="stable"))
         return every.take(first_of_each(discs_of(every), self.overlap))
 
     def _look(self, color: NDArray[np.uint8], scale: float, largest: float) -> tuple[Mask, Circles]:

@@ -99,9 +99,7 @@ def with_bare(
     taken = np.zeros(len(shapes), np.bool_)
     taken[likely] = True
     more = sure.take(_bare(sure.center, sure.radius, shapes, radius, taken))
-    center = np.concatenate([circles.center, more.center])
-    radius, score = np.append(circles.radius, more.radius), np.append(circles.score, more.score)
-    return certain_first(Circles(center, radius, score))
+    return certain_first(circles.joined(more))
 
 
 @jit

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,7 +86,7 @@ class Tracks:
         ids[fresh] = self._next + np.arange(len(fresh))
         self._next += len(fresh)
         unseen = np.setdiff1d(np.arange(len(old)), columns)
-        self._known = _joined(replace(new, id=ids), old.take(unseen))
+        self._known = replace(new, id=ids).joined(old.take(unseen))
         return ids
 
     def _forget(self, stamp_ns: int, memory_ns: int) -> None:
@@ -172,8 +172,3 @@ def _common_shift(new: Sightings, old: Sightings) -> Floats:
     around = uniform_filter(votes.reshape(shape).astype(np.float32), 3, mode="constant")
     peak = np.unravel_index(around.argmax(), around.shape)
     return np.asarray(np.median(steps[(np.abs(cells - peak) <= 1).all(axis=1)], axis=0))
-
-
-def _joined(first: Sightings, second: Sightings) -> Sightings:
-    columns = [(getattr(first, f.name), getattr(second, f.name)) for f in fields(Sightings)]
-    return Sightings(*map(np.concatenate, columns))
