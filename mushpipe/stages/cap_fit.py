@@ -10,7 +10,6 @@ from mushpipe import (
     Camera,
     Circles,
     DepthSource,
-    InputError,
     Locations,
     Poses,
     RgbdFrame,
@@ -18,6 +17,7 @@ from mushpipe import (
     quaternion_from_axis,
 )
 from mushpipe.core.geometry import lengths
+from mushpipe.stages.calibrated import calibration_of
 from mushpipe.stages.cap_batch import Fits, fit_caps
 from mushpipe.stages.cap_clod import CLOD_CHANCE, clods
 from mushpipe.stages.cap_gap import EdgeWatch
@@ -92,20 +92,15 @@ class CapFit(Stage):
             unknown = Locations.unknown(len(circles)), Poses.unknown(len(circles))
             scored = Circles(circles.center, circles.radius, self.scores(frame, circles))
             return self._kept(*unknown, scored)
-        if frame.camera is None:
-            raise InputError(
-                "depth cannot be turned into metres without the camera's calibration: record "
-                "camera_info, or set source.camera: {fx: , fy: , cx: , cy: }"
-            )
-        depth = frame.depth_m
+        camera, depth = calibration_of(frame), frame.depth_m
         order = by_depth(depth, discs_of(circles))
-        fits = self.fit(frame.gray, depth, frame.camera, circles, order)
+        fits = self.fit(frame.gray, depth, camera, circles, order)
         score = self.scores(frame, circles, fits)
         circles = Circles(fits.circle[:, :2], fits.circle[:, 2], score)
         source = np.where(fits.valid, sources(circles, depth), DepthSource.MISSING)
         holes = np.flatnonzero(source == DepthSource.NEIGHBOURS)
         if len(holes):
-            self._bridge(holes, fits, depth, frame.camera, circles, order)
+            self._bridge(holes, fits, depth, camera, circles, order)
         found = self._kept(_locations(fits, source.astype(np.uint8)), _poses(fits), circles)
         self._edges.look(frame, found[-1], self.edge_offset_px)
         return found

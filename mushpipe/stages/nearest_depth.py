@@ -6,14 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mushpipe import Circles, DepthSource, InputError, Locations, RgbdFrame, Stage
+from mushpipe import Camera, Circles, DepthSource, Locations, RgbdFrame, Stage
 from mushpipe.core.geometry import lengths
 from mushpipe.core.jit import jit
+from mushpipe.stages.calibrated import calibration_of
 from mushpipe.stages.discs import discs_of
 from mushpipe.stages.warm_up import example_circles, example_frame
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
+_SIDES = np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
 
 
 class NearestDepth(Stage):
@@ -41,50 +43,55 @@ class NearestDepth(Stage):
             InputError: The frame has depth but no calibration.
         """
         n = len(circles)
-        position, diameter = np.full((n, 3), np.nan), np.full(n, np.nan)
-        source = np.zeros(n, np.uint8)
-        if frame.depth is not None and n:
-            if frame.camera is None:
-                raise InputError(
-                    "depth cannot be turned into metres without the camera's calibration: record "
-                    "camera_info, or set source.camera: {fx: , fy: , cx: , cy: }"
-                )
-            depth = np.fmax(frame.depth_m, np.float32(0))  # missing: 0 in place of NaN
-            depth.flags.writeable = False
-            discs = discs_of(circles)
-            pixels = np.full((n, self.neighbours, 3), np.nan)
-            found = nearest(depth, discs, self.neighbours, pixels)
-            points = frame.camera.deproject(pixels[..., :2], pixels[..., 2])
-            off = np.abs(pixels[:, 0, :2] - circles.center).max(axis=1)
-            # The centre pixel is the one the centre rounds to.
-            measured = (found > 0) & (off <= 0.5)
-            points[measured, 1:] = np.nan
-            seen = np.asarray(np.isfinite(points).all(axis=2))  # the lens may have no ray there
-            points[~seen] = np.nan
-            some = seen.any(axis=1)
-            position[some] = np.nanmean(points[some], axis=1)
-            source[some] = DepthSource.NEIGHBOURS
-            source[measured & some] = DepthSource.MEASURED
-            rim = np.full((n, 4), np.nan)
-            ends(depth, discs, rim)
-            corners = circles.center[:, None] + circles.radius[:, None, None] * _SIDES
-            rims = frame.camera.deproject(corners, rim)
-            spans = np.linalg.norm(rims[:, 1::2] - rims[:, ::2], axis=2)
-            known = np.isfinite(spans)
-            count = np.maximum(known.sum(axis=1), 1)
-            diameter = np.where(known, spans, 0).sum(axis=1) / count
-            diameter[~known.any(axis=1)] = np.nan
+        if frame.depth is None or not n:
+            return Locations.unknown(n)
+        camera = calibration_of(frame)
+        depth = np.fmax(frame.depth_m, np.float32(0))  # missing: 0 in place of NaN
+        depth.flags.writeable = False
+        discs = discs_of(circles)
+        position, source = self._positions(depth, camera, discs)
         return Locations(
             position=position,
             distance=lengths(position),
-            diameter=diameter,
+            diameter=_diameters(depth, camera, discs),
             source=source,
             sigma_position=np.full((n, 3), np.nan),
             sigma_diameter=np.full(n, np.nan),
         )
 
+    def _positions(
+        self, depth: Singles, camera: Camera, discs: Floats
+    ) -> tuple[Floats, NDArray[np.uint8]]:
+        """Return positions (N, 3), m, and their sources (N,)."""
+        n = len(discs)
+        position, source = np.full((n, 3), np.nan), np.full(n, DepthSource.MISSING, np.uint8)
+        pixels = np.full((n, self.neighbours, 3), np.nan)
+        found = nearest(depth, discs, self.neighbours, pixels)
+        points = camera.deproject(pixels[..., :2], pixels[..., 2])
+        off = np.abs(pixels[:, 0, :2] - discs[:, :2]).max(axis=1)
+        # The centre pixel is the one the centre rounds to.
+        measured = (found > 0) & (off <= 0.5)
+        points[measured, 1:] = np.nan
+        seen = np.asarray(np.isfinite(points).all(axis=2))  # the lens may have no ray there
+        points[~seen] = np.nan
+        some = seen.any(axis=1)
+        position[some] = np.nanmean(points[some], axis=1)
+        source[some] = DepthSource.NEIGHBOURS
+        source[measured & some] = DepthSource.MEASURED
+        return position, source
 
-_SIDES = np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
+
+def _diameters(depth: Singles, camera: Camera, discs: Floats) -> Floats:
+    """Return the means (N,) of the distances of opposite ends, m, that are known."""
+    rim = np.full((len(discs), 4), np.nan)
+    ends(depth, discs, rim)
+    corners = discs[:, None, :2] + discs[:, 2, None, None] * _SIDES
+    rims = camera.deproject(corners, rim)
+    spans = np.linalg.norm(rims[:, 1::2] - rims[:, ::2], axis=2)
+    known = np.isfinite(spans)
+    diameter = np.where(known, spans, 0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+    diameter[~known.any(axis=1)] = np.nan
+    return np.asarray(diameter)
 
 
 @jit

@@ -12,7 +12,6 @@ from pydantic import Field, PrivateAttr
 from mushpipe import (
     Circles,
     GraphPath,
-    InputError,
     Locations,
     Poses,
     RgbdFrame,
@@ -20,6 +19,7 @@ from mushpipe import (
     quaternion_from_axis,
 )
 from mushpipe.core.libraries import import_open3d
+from mushpipe.stages.calibrated import calibration_of
 from mushpipe.stages.discs import radii_on_rays
 from mushpipe.stages.upright import Up, pixel_rays, upright
 from mushpipe.stages.upright_model import Model, made, read
@@ -121,18 +121,14 @@ class Registration(Stage):
         Raises:
             InputError: The frame has no calibration.
         """
-        if frame.camera is None:
-            raise InputError(
-                "depth cannot be turned into metres without the calibration: record camera_info, "
-                "or set source.camera: {fx: , fy: , cx: , cy: }"
-            )
+        camera = calibration_of(frame)
         if self._model is None:
             self.open()
         position, radius = locations.position[row], circles.radius[row]
         if not np.isfinite(position).all():
             return None
-        depth, rays = np.fmax(frame.depth_m, np.float32(0)), pixel_rays(frame.camera)
-        size = float(radii_on_rays(circles, frame.camera)[row] * position[2])
+        depth, rays = np.fmax(frame.depth_m, np.float32(0)), pixel_rays(camera)
+        size = float(radii_on_rays(circles, camera)[row] * position[2])
         if not np.isfinite(size):
             return None
         points = _inside(depth, rays, circles.center[row], radius, size)

@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mushpipe import Camera, Circles, DepthSource, InputError, Locations, RgbdFrame, Stage
+from mushpipe import Camera, Circles, DepthSource, Locations, RgbdFrame, Stage
 from mushpipe.core.geometry import lengths
 from mushpipe.core.jit import borrower
+from mushpipe.stages.calibrated import calibration_of
 from mushpipe.stages.cap_blocks import CELLS
 from mushpipe.stages.cap_order import Order, by_depth
 from mushpipe.stages.cap_samples import ASTRAY
@@ -55,20 +56,15 @@ class SurfaceFit(Stage):
         """
         if frame.depth is None or not len(circles):
             return Locations.unknown(len(circles))
-        if frame.camera is None:
-            raise InputError(
-                "depth cannot be turned into metres without the camera's calibration: record "
-                "camera_info, or set source.camera: {fx: , fy: , cx: , cy: }"
-            )
-        depth = frame.depth_m
+        camera, depth = calibration_of(frame), frame.depth_m
         discs = discs_of(circles)
         noise = (self.depth_noise_mm / 1000, self.depth_noise_per_m / 1000)
-        surface, covariance, seen = fit_tops(depth, frame.camera, discs, noise, self.min_points)
-        focal = (frame.camera.fx + frame.camera.fy) / 2
+        surface, covariance, seen = fit_tops(depth, camera, discs, noise, self.min_points)
+        focal = (camera.fx + camera.fy) / 2
         pixel = self.circle_sigma_px * surface[:, 0] / focal  # its sigma on the cap, m
-        size = radii_on_rays(circles, frame.camera) * surface[:, 0]
+        size = radii_on_rays(circles, camera) * surface[:, 0]
         smooth = without_tip(surface, covariance)
-        ray = frame.camera.deproject(circles.center, np.ones(len(circles)))
+        ray = camera.deproject(circles.center, np.ones(len(circles)))
         position = ray * surface[:, :1]
         own, other = seen.T
         along = variance_along(smooth[0], covariance, size, pixel)
