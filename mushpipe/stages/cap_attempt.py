@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import borrower, jit
-from mushpipe.stages.cap_blocks import Cut, own_depth, room_to_cut
+from mushpipe.stages.cap_blocks import Cut, Image, Sensor, own_depth, room_to_cut
 from mushpipe.stages.cap_model import HEIGHT, ROOM, SIZE, Floats, Singles, Vector
 from mushpipe.stages.cap_outline import LANES_ROOM, expected_reach, sample_outline
 from mushpipe.stages.cap_regrow import denials, regrow
@@ -28,7 +28,7 @@ from mushpipe.stages.cap_samples import (
     sample_edges,
     touch,
 )
-from mushpipe.stages.cap_solve import ROUND, STAGES, refine, variance_of_tilt, workspace
+from mushpipe.stages.cap_solve import ROUND, STAGES, Noise, refine, variance_of_tilt, workspace
 from mushpipe.stages.cap_start import CONICAL, USUAL, axis_of, start
 
 POOR = 0.9  # misfit (a usual cap has 0.25) at which a fit starts again; it widens the sigmas, too
@@ -38,6 +38,30 @@ DENIED = 4  # in so many of 32 directions, and the circle is put right;
 DENIAL = 0.05  # each counts as so much misfit,
 MENDED = 0.7  # and so much smaller the sum must be in another circle
 COUNTS = 8  # numbers that are kept of a fit, see `fit_circle`
+
+
+class Frame(NamedTuple):
+    """What caps are fitted to: luma (H, W) 0..1, depth, and the focal length, px."""
+
+    gray: Singles
+    image: Image
+    focal: float
+
+
+class Settings(NamedTuple):
+    """How caps are fitted.
+
+    Attributes:
+        noise: Standard deviations of the model.
+        sensor: The depth camera.
+        outline_px: Sigma of the outline in colour, px.
+        least: Fewest points that make a fit.
+    """
+
+    noise: Noise
+    sensor: Sensor
+    outline_px: float
+    least: int
 
 
 class Fit(NamedTuple):
@@ -83,11 +107,11 @@ def scratch(height: int, width: int) -> Any:
 
 @borrower
 def gather(
-    image: Any,
+    image: Image,
     circle: Floats,
     rank: int,
     focal: float,
-    sensor: tuple[float, float, float, float],
+    sensor: Sensor,
     room: Any,
     rays: Singles,
 ) -> tuple[int, int, int, float]:
@@ -97,35 +121,35 @@ def gather(
         Numbers of its points, of points of other depth and of edge rays; its middle depth, m.
     """
     cut, lanes = room.cut, room.lanes
-    window = own_depth(image[0], image[2], rank, circle, OUTER, cut.own)
-    n, other, middle = sample_depth(window, cut, image[1], circle, focal, sensor, rays[:, ROUND:])
+    window = own_depth(image.depth, image.ranks, rank, circle, OUTER, cut.own)
+    n, other, middle = sample_depth(window, cut, image.rays, circle, focal, sensor, rays[:, ROUND:])
     if n == 0:
         return 0, other, 0, 0.0
     edges = rays[:, ROUND + n :]
-    m = sample_edges(window, cut.own, image[1], circle, focal, middle, sensor[3], lanes, edges)
+    m = sample_edges(window, cut.own, image.rays, circle, focal, middle, sensor.edge, lanes, edges)
     for j in range(ROUND):
         turn = COMPASS[j * (DIRECTIONS // ROUND)]
         x, y = circle[0] + circle[2] * turn[0], circle[1] + circle[2] * turn[1]
-        touch(rays, j, place(image[1], focal, x, y), 0.0, 0.0)
+        touch(rays, j, place(image.rays, focal, x, y), 0.0, 0.0)
     normalise(rays, ROUND + n + m)
-    return n, other, m, middle - sensor[2]
+    return n, other, m, middle - sensor.bias
 
 
 @borrower
 def attempt(
-    frame: Any, circle: Floats, rank: int, size: float, seen: tuple[Singles, int],
-    upright: tuple[Vector, float], settings: Any, cap: Floats, room: Any,
+    frame: Frame, circle: Floats, rank: int, size: float, seen: tuple[Singles, int],
+    upright: tuple[Vector, float], settings: Settings, cap: Floats, room: Any,
 ) -> tuple[int, float]:  # fmt: skip
     """Fit a cap from where it starts: to its depth, then to its outline in colour as well.
 
     Args:
-        frame: As in `fit_cap`.
+        frame: What it is fitted to.
         circle: (3,) x, y, radius, px.
         rank: Of the circle.
         size: Its radius at the cap, m.
         seen: The cap's rays (6, ROOM), with room for those of the outline, and how many there are.
         upright: Unit vector and spread of tilts, rad.
-        settings: As in `fit_cap`.
+        settings: How.
         cap: (15,) parameters, in and out.
         room: From `scratch`; the last step's normal matrix, factored, stays in its workspace.
 
@@ -133,12 +157,13 @@ def attempt(
         Number of rays along the outline in colour, and the misfit, infinite without a solution.
     """
     gray, image, focal = frame
-    (rays, count), setting, work = seen, (settings[0], 1.0 / focal, size), room.work
+    (rays, count), setting, work = seen, (settings.noise, 1.0 / focal, size), room.work
     if refine(cap, rays, count, upright, setting, STAGES[0], STAGES[1], work)[0] < 0.0:
         return 0, np.inf
     lines = sample_outline(
-        gray, image[1], image[2], rank, cap, circle, focal, settings[2], room.lanes, rays[:, count:]
-    )
+        gray, image.rays, image.ranks, rank, cap, circle, focal, settings.outline_px, room.lanes,
+        rays[:, count:],
+    )  # fmt: skip
     total, misfit = refine(cap, rays, count + lines, upright, setting, STAGES[1], STAGES[2], work)
     return (lines, misfit) if total >= 0.0 else (0, np.inf)
 
@@ -153,17 +178,17 @@ def take(rays: Singles, other: Singles, first: int, last: int) -> None:
 
 @borrower
 def fit_circle(
-    frame: Any, circle: Floats, rank: int, upright: tuple[Vector, float], settings: Any, fit: Any,
-    room: Any,
+    frame: Frame, circle: Floats, rank: int, upright: tuple[Vector, float], settings: Settings,
+    fit: Any, room: Any,
 ) -> float:  # fmt: skip
     """Fit the cap in a circle, from several starts if the first fit is poor; return the misfit.
 
     Args:
-        frame: As in `fit_cap`.
+        frame: What it is fitted to.
         circle: (3,) x, y, radius, px.
         rank: Of the circle.
         upright: Unit vector and spread of tilts, rad.
-        settings: As in `fit_cap`.
+        settings: How.
         fit: Out: rays (6, ROOM), parameters (15,), and counts (8,) of points, edge rays, outline
             rays, weight; size, m; misfit; points of other depth; variance of the tilt, rad^2, per
             direction. Without a fit the counts stay as they are and the misfit is infinite.
@@ -171,11 +196,11 @@ def fit_circle(
     """
     _, image, focal = frame
     (rays, cap, counts), rival, normal = fit, room.rival, room.work[0][0]
-    n, other, m, middle = gather(image, circle, rank, focal, settings[1], room, rays)
-    if n < settings[3] or middle <= 0.0:
+    n, other, m, middle = gather(image, circle, rank, focal, settings.sensor, room, rays)
+    if n < settings.least or middle <= 0.0:
         return np.inf
     size, count, points = circle[2] * middle / focal, ROUND + n + m, rays[:, ROUND:]
-    ray = ray_at(image[1], focal, circle[0], circle[1])
+    ray = ray_at(image.rays, focal, circle[0], circle[1])
     start(cap, axis_of(points, n, upright[0], ray, USUAL[0]), USUAL, ray, middle, size)
     lines, misfit = attempt(frame, circle, rank, size, (rays, count), upright, settings, cap, room)
     variance = variance_of_tilt(normal)
@@ -199,17 +224,17 @@ def fit_circle(
 
 @borrower
 def denied_by(
-    frame: Any, circle: Floats, ranks: tuple[int, int], cap: Floats, bias: float, room: Any
+    frame: Frame, circle: Floats, ranks: tuple[int, int], cap: Floats, bias: float, room: Any
 ) -> int:
     """Return in how many directions depth denies the outline of a cap (15,) fitted in a circle."""
-    expected_reach(cap, frame[1][1], frame[2], circle, *room.lanes)
-    return denials(frame[1], ranks, cap, bias, circle, room.lanes[0])
+    expected_reach(cap, frame.image.rays, frame.focal, circle, *room.lanes)
+    return denials(frame.image, ranks, cap, bias, circle, room.lanes[0])
 
 
 @borrower
 def fit_cap(
-    frame: Any, circle: Floats, ranks: tuple[int, int], upright: tuple[Vector, float],
-    settings: Any, fit: Fit, room: Any,
+    frame: Frame, circle: Floats, ranks: tuple[int, int], upright: tuple[Vector, float],
+    settings: Settings, fit: Fit, room: Any,
 ) -> None:  # fmt: skip
     """Fit the cap in a circle; where depth denies it, in the circle that depth suggests, too.
 
@@ -217,13 +242,11 @@ def fit_cap(
     whatever hides it.
 
     Args:
-        frame: Luma (H, W); depth (H, W) m, missing where not above 0, with rays (H, W, 2) and
-            ranks (H, W); focal length, px.
+        frame: What it is fitted to.
         circle: (3,) x, y, radius, px, as detected.
         ranks: Of the circle, and of no circle.
         upright: Unit vector and spread of tilts, rad.
-        settings: `Noise`; sigma of depth (2), bias (m) and edge offset (px); sigma of the outline
-            in colour, px; fewest points.
+        settings: How.
         fit: Out, as by `fit_circle`; without a fit it keeps its count of 0.
         room: From `scratch`.
     """
@@ -231,12 +254,12 @@ def fit_cap(
     astray = fit.counts[6] > ASTRAY * (fit.counts[0] + fit.counts[6])
     if astray or not ODD < misfit < np.inf:
         return
-    other, grown, bias = room.other, room.grown, settings[1][2]
+    other, grown, bias = room.other, room.grown, settings.sensor.bias
     denied = denied_by(frame, circle, ranks, fit.cap, bias, room)
     if misfit < POOR and denied < DENIED:
         return
     middle = fit.cap[2] - 0.5 * fit.cap[HEIGHT] + bias
-    if not regrow(frame[1], ranks, circle, frame[2], middle, grown):
+    if not regrow(frame.image, ranks, circle, frame.focal, middle, grown):
         return
     rest = fit_circle(frame, grown, ranks[0], upright, settings, other, room)
     if not rest < 2.0 * POOR:

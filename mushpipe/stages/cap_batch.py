@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import borrower, jit
-from mushpipe.stages.cap_attempt import COUNTS, POOR, Fit, fit_cap, scratch
+from mushpipe.stages.cap_attempt import COUNTS, POOR, Fit, Frame, Settings, fit_cap, scratch
 from mushpipe.stages.cap_blocks import CELLS
 from mushpipe.stages.cap_circle import improve
 from mushpipe.stages.cap_model import (
@@ -27,9 +27,8 @@ from mushpipe.stages.cap_model import (
     meet,
     slope,
 )
-from mushpipe.stages.cap_order import Order
 from mushpipe.stages.cap_samples import ASTRAY, DIRECTIONS, ray_at
-from mushpipe.stages.cap_solve import ROUND, STAGES, Noise, invert, refine, tilt
+from mushpipe.stages.cap_solve import ROUND, STAGES, invert, refine, tilt
 from mushpipe.stages.cap_start import spread_of
 
 ROUNDNESS = 0.01  # in rim radii: how far the rim of a cap is from the circle of its area
@@ -84,7 +83,7 @@ class Fits:
 
 @borrower
 def second_fit(
-    frame: Any, circle: Floats, upright: tuple[Vector, float], settings: Any, fit: Fit,
+    frame: Frame, circle: Floats, upright: tuple[Vector, float], settings: Settings, fit: Fit,
     covariance: Floats, told: Floats, room: Any,
 ) -> None:  # fmt: skip
     """Refine a fit with what the scene says of its cap's tilt, and then its circle, in place.
@@ -93,7 +92,7 @@ def second_fit(
     `locate` and `describe` fill it. If any of it is not finite, the count of points becomes 0.
     """
     _, image, focal = frame
-    (rays, cap, counts), noise = fit, settings[0]
+    (rays, cap, counts), noise = fit, settings.noise
     count = ROUND + int(counts[0] + counts[1] + counts[2])
     setting = (noise, 1.0 / focal, counts[4])
     counts[3], counts[5] = refine(
@@ -101,8 +100,8 @@ def second_fit(
     )
     invert(room.work[0][0], covariance)
     held, doubt = (counts[1], counts[2]), max(1.0, counts[5] / POOR)
-    improve(circle, cap, held, doubt, image[1], focal, room.lanes)
-    ray = ray_at(image[1], focal, circle[0], circle[1])
+    improve(circle, cap, held, doubt, image.rays, focal, room.lanes)
+    ray = ray_at(image.rays, focal, circle[0], circle[1])
     locate(cap, ray, covariance, noise.circle_px / focal, told)
     describe(fit, covariance, told)
     total = counts[3] + counts[5]
@@ -116,22 +115,22 @@ def second_fit(
 
 @jit
 def fit_all(
-    frame: Any, circles: Floats, rank: NDArray[np.int64], upright: tuple[Vector, float],
-    settings: Any, out: Any,
+    frame: Frame, circles: Floats, rank: NDArray[np.int64], upright: tuple[Vector, float],
+    settings: Settings, out: Any,
 ) -> None:  # fmt: skip
     """Fit every cap, first with the same prior for all, then with what they say of the scene.
 
     Args:
-        frame: As in `fit_cap`.
+        frame: What they are fitted to.
         circles: (N, 3) x, y, radius, px.
         rank: (N,) of them, as `ranks` from `by_depth`.
-        upright: As in `fit_cap`.
-        settings: As in `fit_cap`.
+        upright: Unit vector and spread of tilts, rad.
+        settings: How.
         out: Per cap its circle, improved; parameters, covariance, what follows, and counts, as by
             `second_fit`. A cap without a fit keeps its circle and has a count of 0, the rest NaN.
     """
     improved, caps, covariances, told, counts = out
-    room, n = scratch(*frame[1][0].shape), len(circles)
+    room, n = scratch(*frame.image.depth.shape), len(circles)
     rays = np.empty((n, 6, ROOM), np.float32)
     squares, variances, spreads = np.full(n, -1.0), np.ones(n), np.empty(n)
     for i in range(n):
@@ -210,25 +209,22 @@ def describe(fit: Fit, covariance: Floats, told: Floats) -> None:
 
 
 def fit_caps(
-    frame: tuple[NDArray[np.float32], tuple[NDArray[np.float32], NDArray[np.float32]], float],
+    frame: Frame,
     circles: Floats,
-    order: Order,
+    rank: NDArray[np.int64],
     upright: tuple[Floats, float],
-    settings: tuple[Noise, tuple[float, float, float, float], float, int],
+    settings: Settings,
 ) -> Fits:
     """Fit a cap to the depth in each circle.
 
     Args:
-        frame: Luma (H, W) 0..1; depth (H, W) m, missing where not above 0, and the rays (H, W, 2)
-            of the pixels at z = 1; focal length, px.
+        frame: What they are fitted to.
         circles: (N, 3) x, y, radius, px.
-        order: From `by_depth`.
+        rank: (N,) of them, as `ranks` from `by_depth`.
         upright: Unit vector (3,) and the spread of tilts off it per direction, rad.
-        settings: Standard deviations of the model; of the sensor: sigma of depth at the camera (m)
-            and its growth (m per m), bias (m), and how much of an edge it loses (px); sigma of the
-            outline in colour, px; the fewest points that make a fit.
+        settings: How.
     """
-    n, (gray, image, focal) = len(circles), frame
+    n = len(circles)
     out = (
         np.empty((n, 3)),
         np.empty((n, SIZE)),
@@ -236,9 +232,8 @@ def fit_caps(
         np.empty((n, TOLD)),
         np.zeros((n, COUNTS)),
     )
-    rank, ranks = order
     up = (float(upright[0][0]), float(upright[0][1]), float(upright[0][2]))
-    fit_all((gray, (*image, ranks), focal), circles, rank, (up, upright[1]), settings, out)
+    fit_all(frame, circles, rank, (up, upright[1]), settings, out)
     return _fits(*out, upright[0])
 
 

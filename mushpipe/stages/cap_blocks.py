@@ -25,6 +25,36 @@ CELL_X, CELL_Y = np.pad(CELLS, ((0, K - len(CELLS)), (0, 0))).T.copy()
 COUNT, U, V, DEPTH, SPREAD = range(5)
 
 
+class Image(NamedTuple):
+    """Depth as kernels see it.
+
+    Attributes:
+        depth: (H, W) m, missing where not above 0.
+        rays: (H, W, 2) rays of the pixels at z = 1, beyond 1e3 where a pixel has none.
+        ranks: (H, W) rank of the nearest circle that covers the pixel, from `by_depth`.
+    """
+
+    depth: Singles
+    rays: Singles
+    ranks: NDArray[np.int16]
+
+
+class Sensor(NamedTuple):
+    """A depth camera.
+
+    Attributes:
+        noise: Sigma of depth at the camera, m.
+        growth: Its growth with depth, m per m.
+        bias: Of the depth, m.
+        edge: How much of an edge it loses, px.
+    """
+
+    noise: float
+    growth: float
+    bias: float
+    edge: float
+
+
 class Window(NamedTuple):
     """A part of an image, px: its first column and row, and its size."""
 

@@ -18,7 +18,9 @@ from mushpipe import (
 )
 from mushpipe.core.geometry import lengths
 from mushpipe.stages.calibrated import calibration_of
+from mushpipe.stages.cap_attempt import Frame, Settings
 from mushpipe.stages.cap_batch import Fits, fit_caps
+from mushpipe.stages.cap_blocks import Image, Sensor
 from mushpipe.stages.cap_clod import CLOD_CHANCE, clods
 from mushpipe.stages.cap_gap import EdgeWatch
 from mushpipe.stages.cap_kin import FEWEST, kin_of, unlike
@@ -156,18 +158,19 @@ class CapFit(Stage):
             firm=15.0,
             usual=0.25,
         )
-        sensor = (
-            self.depth_noise_mm / 1000,
-            self.depth_noise_per_m / 1000,
-            self.depth_bias_mm / 1000,
-            self.edge_offset_px,
+        sensor = Sensor(
+            noise=self.depth_noise_mm / 1000,
+            growth=self.depth_noise_per_m / 1000,
+            bias=self.depth_bias_mm / 1000,
+            edge=self.edge_offset_px,
         )
+        rank, ranks = order or by_depth(depth, discs)
         return fit_caps(
-            (gray, (depth, rays), (camera.fx + camera.fy) / 2),
+            Frame(gray, Image(depth, rays, ranks), (camera.fx + camera.fy) / 2),
             discs,
-            order or by_depth(depth, discs),
+            rank,
             (upright(self.up, depth, rays), float(np.radians(self.tilt_deg))),
-            (noise, sensor, self.outline_sigma_px, self.min_points),
+            Settings(noise, sensor, self.outline_sigma_px, self.min_points),
         )
 
     def _bridge(

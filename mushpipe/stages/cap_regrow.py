@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from mushpipe.core.jit import borrower, jit
+from mushpipe.stages.cap_blocks import Image
 from mushpipe.stages.cap_linear import tukey
 from mushpipe.stages.cap_model import HEIGHT, RADIUS, Floats, N, Singles
 from mushpipe.stages.cap_samples import COMPASS, DIRECTIONS
@@ -21,16 +20,16 @@ HELD = np.array([0.02, 0.02, 0.05])  # weight of the detected x, y and radius, t
 
 
 @borrower
-def look(image: Any, circle: Floats, j: int, far: float) -> tuple[float, int]:
+def look(image: Image, circle: Floats, j: int, far: float) -> tuple[float, int]:
     """Return depth (m, 0 = missing) and rank (-1 out of the image) in a direction of `COMPASS`.
 
     Args:
-        image: Depth (H, W) m, missing where not above 0; rays; ranks (H, W) from `by_depth`.
+        image: Where it is looked.
         circle: (3,) x, y, radius, px.
         j: Number of the direction.
         far: Distance from the centre, px.
     """
-    depth, _, ranks = image
+    depth, ranks = image.depth, image.ranks
     u = int(np.floor(circle[0] + far * COMPASS[j, 0] + 0.5))
     v = int(np.floor(circle[1] + far * COMPASS[j, 1] + 0.5))
     if 0 <= v < depth.shape[0] and 0 <= u < depth.shape[1]:
@@ -40,7 +39,7 @@ def look(image: Any, circle: Floats, j: int, far: float) -> tuple[float, int]:
 
 @borrower
 def denials(
-    image: Any, ranks: tuple[int, int], cap: Floats, bias: float, circle: Floats, reach: Singles
+    image: Image, ranks: tuple[int, int], cap: Floats, bias: float, circle: Floats, reach: Singles
 ) -> int:
     """Return in how many directions depth denies the outline of a fitted cap.
 
@@ -70,7 +69,7 @@ def denials(
 
 @borrower
 def end_along(
-    image: Any, ranks: tuple[int, int], circle: Floats, j: int, gate: tuple[float, float, float]
+    image: Image, ranks: tuple[int, int], circle: Floats, j: int, gate: tuple[float, float, float]
 ) -> float:
     """Return how far (px) a surface reaches until something deeper follows; -1 if none is seen to.
 
@@ -99,7 +98,7 @@ def end_along(
 
 @jit
 def regrow(
-    image: Any, ranks: tuple[int, int], circle: Floats, focal: float, middle: float, out: Floats
+    image: Image, ranks: tuple[int, int], circle: Floats, focal: float, middle: float, out: Floats
 ) -> bool:
     """Fill the circle (3,) around the surface in a circle, by where it ends; False if unknown.
 

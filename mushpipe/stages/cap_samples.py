@@ -18,6 +18,7 @@ from mushpipe.stages.cap_blocks import (
     SPREAD,
     Cut,
     K,
+    Sensor,
     U,
     V,
     Window,
@@ -51,7 +52,7 @@ def sample_depth(
     rays: Singles,
     circle: Floats,
     focal: float,
-    sensor: tuple[float, float, float, float],
+    sensor: Sensor,
     out: Singles,
 ) -> tuple[int, int, float]:
     """Take the points of a cap: block means on a grid inside its circle, gated around its depth.
@@ -62,7 +63,7 @@ def sample_depth(
         rays: (H, W, 2) rays at z = 1, beyond 1e3 where a pixel has none.
         circle: (3,) x, y, radius, px.
         focal: Focal length, px.
-        sensor: Sigma of depth is sensor[0] + sensor[1] z, m; its bias is sensor[2], m.
+        sensor: What took the depth.
         out: (6, M) out: x and y of the ray at z = 1, 1; z and its sigma (m), share that counts as
             independent.
 
@@ -84,7 +85,7 @@ def sample_depth(
         if radius < CROWDED and _taken(cut.pixels, j):
             continue
         z = blocks[j + DEPTH * K]
-        sigma = sensor[0] + sensor[1] * z
+        sigma = sensor.noise + sensor.growth * z
         even = (2.5 * sigma) ** 2 + step
         if blocks[j + COUNT * K] <= least or blocks[j + SPREAD * K] > even:
             continue
@@ -94,7 +95,7 @@ def sample_depth(
         x, y = place(rays, focal, blocks[j + U * K], blocks[j + V * K])
         if abs(x) > 1e3:
             continue  # where the lens has none
-        out[0, n], out[1, n], out[2, n], out[3, n] = x, y, 1.0, z - sensor[2]
+        out[0, n], out[1, n], out[2, n], out[3, n] = x, y, 1.0, z - sensor.bias
         out[4, n] = sigma * (0.3 + 0.7 / np.sqrt(blocks[j + COUNT * K]))
         out[5, n] = POINT_SHARE
         n += 1

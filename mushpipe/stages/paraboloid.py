@@ -12,6 +12,7 @@ from mushpipe.stages.cap_blocks import (
     CELLS,
     DEPTH,
     SPREAD,
+    Image,
     K,
     U,
     V,
@@ -41,7 +42,7 @@ INNER = np.flatnonzero((CELLS**2).sum(axis=1) < DISC**2)
 
 @jit
 def fit_surfaces(
-    image: Any,
+    image: Image,
     discs: Floats,
     rank: NDArray[np.int64],
     rows: NDArray[np.intp],
@@ -55,7 +56,7 @@ def fit_surfaces(
     q = sqrt(x^2 + y^2 + BLUNT^2) - BLUNT is the tip of a pointed cap: a cone with a blunt end.
 
     Args:
-        image: Depth (H, W) m, missing where not above 0; rays (H, W, 2); ranks (H, W).
+        image: What they are fitted to.
         discs: (N, 3) x, y, radius, px.
         rank: (N,) of them, as `ranks` from `by_depth`.
         rows: (M,) which of them are fitted.
@@ -69,7 +70,7 @@ def fit_surfaces(
     """
     near = np.empty((COEFFICIENTS + 2, len(INNER)))
     weighted = np.empty((COEFFICIENTS + 1, len(INNER)))
-    cut = room_to_cut(*image[0].shape)
+    cut = room_to_cut(*image.depth.shape)
     seen = np.zeros((len(rows), 2), np.int64)
     for k in range(len(rows)):
         i = rows[k]
@@ -87,13 +88,13 @@ def fit_surfaces(
 
 @borrower
 def sample_inner(
-    image: Any, rank: int, disc: Floats, focal: float, noise: tuple[float, float], cut: Any,
+    image: Image, rank: int, disc: Floats, focal: float, noise: tuple[float, float], cut: Any,
     out: Floats,
 ) -> tuple[int, float]:  # fmt: skip
     """Take block means on a grid in the inner part of a circle; arguments as `fit_surfaces`.
 
     Args:
-        image: Depth, rays and ranks.
+        image: Where they are taken.
         rank: This circle's.
         disc: (3,) x, y, radius, px.
         focal: Focal length, px.
@@ -105,11 +106,11 @@ def sample_inner(
         Number of points, and the middle depth (m), 0 without any.
     """
     half, blocks = half_width(disc[2]), cut.blocks
-    average(own_depth(image[0], image[2], rank, disc, 1.0, cut.own), disc, half, cut)
+    average(own_depth(image.depth, image.ranks, rank, disc, 1.0, cut.own), disc, half, cut)
     middle = middle_depth(cut, half, DISC * DISC)
     if middle <= 0.0:
         return 0, 0.0
-    center = ray_at(image[1], focal, disc[0], disc[1])
+    center = ray_at(image.rays, focal, disc[0], disc[1])
     size = disc[2] * middle / focal
     sigma = noise[0] + noise[1] * middle
     even = (2.5 * sigma) ** 2 + (0.6 * size * (2 * half + 1) / disc[2]) ** 2
@@ -120,7 +121,7 @@ def sample_inner(
             continue
         if blocks[j + SPREAD * K] > even or not middle - 0.8 * size < z < middle + size:
             continue
-        ray = ray_at(image[1], focal, blocks[j + U * K], blocks[j + V * K])
+        ray = ray_at(image.rays, focal, blocks[j + U * K], blocks[j + V * K])
         if ray[2] < 1e-3:
             continue  # where the lens has none
         x = (ray[0] / ray[2] - center[0] / center[2]) * focal / disc[2]
@@ -136,9 +137,9 @@ def sample_inner(
 
 
 @borrower
-def count_seen(image: Any, rank: int, disc: Floats, gate: tuple[float, float]) -> tuple[int, int]:
+def count_seen(image: Image, rank: int, disc: Floats, gate: tuple[float, float]) -> tuple[int, int]:
     """Return on how many points of the grid depth lies within a cap's gate (m), and outside."""
-    depth, _, ranks = image
+    depth, ranks = image.depth, image.ranks
     own, other = 0, 0
     for j in range(len(CELLS)):
         u = int(np.floor(disc[0] + disc[2] * CELLS[j, 0] + 0.5))

@@ -10,7 +10,7 @@ from mushpipe import Camera, Circles, DepthSource, Locations, RgbdFrame, Stage
 from mushpipe.core.geometry import lengths
 from mushpipe.core.jit import borrower
 from mushpipe.stages.calibrated import calibration_of
-from mushpipe.stages.cap_blocks import CELLS
+from mushpipe.stages.cap_blocks import CELLS, Image
 from mushpipe.stages.cap_order import Order, by_depth
 from mushpipe.stages.cap_samples import ASTRAY
 from mushpipe.stages.discs import discs_of, radii_on_rays
@@ -109,7 +109,7 @@ def fit_tops(
         order: From `by_depth`, if that is known.
     """
     rank, ranks = order or by_depth(depth, discs)
-    image = (depth, pixel_rays(camera), ranks)
+    image = Image(depth, pixel_rays(camera), ranks)
     chosen = np.arange(len(discs)) if rows is None else rows
     n = len(chosen)
     surface = np.full((n, COEFFICIENTS), np.nan)

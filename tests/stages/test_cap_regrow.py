@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mushpipe import Circles
+from mushpipe.stages.cap_blocks import Image
 from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.cap_linear import solve3
 from mushpipe.stages.cap_model import SIZE, span
@@ -18,10 +19,10 @@ BED = 0.44
 LOW = cap(15, 60, (0, 0, 0.4), 0.022, 0.55)
 
 
-def seen(*caps: object) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Depth, rays, and ranks without a circle, of one."""
+def seen(*caps: object) -> Image:
+    """Caps, with ranks of a single circle that covers nothing."""
     depth, _ = draw(list(caps), BED)
-    return depth.astype(np.float32), pixel_rays(CAMERA), np.ones(depth.shape, np.int16)
+    return Image(depth.astype(np.float32), pixel_rays(CAMERA), np.ones(depth.shape, np.int16))
 
 
 @given(st.integers(0, 2**31))
@@ -49,7 +50,7 @@ def test_a_surface_is_followed_to_where_it_ends(wrong: tuple[float, float, float
 
 def test_a_surface_without_an_end_gives_no_circle() -> None:
     image = seen(LOW)
-    endless = np.where(image[0] < BED, image[0], np.float32(0)), *image[1:]
+    endless = image._replace(depth=np.where(image.depth < BED, image.depth, np.float32(0)))
     circles = circles_of([LOW])
     circle = np.append(circles.center[0], circles.radius[0])
     assert not regrow(endless, (0, 1), circle, CAMERA.fx, 0.395, np.empty(3))
