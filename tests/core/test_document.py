@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from mushpipe.core.document import Document, parse_document, read_document
 from mushpipe.core.errors import GraphError
-from tests.core.lab import cli
 
 HERE = Path("/graphs")
 
@@ -117,14 +116,6 @@ BROKEN = {
 @pytest.mark.parametrize(("text", "expected"), BROKEN.values(), ids=BROKEN)
 def test_what_is_refused_and_how_it_is_said(text, expected):
     assert refused(text) == expected
-
-
-@pytest.mark.parametrize(("text", "expected"), BROKEN.values(), ids=BROKEN)
-def test_the_program_prints_it_and_ends_with_2(tmp_path, monkeypatch, capsys, text, expected):
-    monkeypatch.chdir(tmp_path)
-    Path("g.yaml").write_text(text)
-    assert cli(monkeypatch, "run", "g.yaml") == 2
-    assert capsys.readouterr() == ("", f"error: {expected}\n")
 
 
 @pytest.mark.parametrize(

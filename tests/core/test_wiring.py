@@ -27,7 +27,7 @@ from mushpipe import (
 from mushpipe.core.errors import PluginError
 from mushpipe.core.plan import Link
 from mushpipe.core.ports import Port, Ports, ports_of
-from tests.core.lab import Both, Dice, Frames, Invert, Lab, cli
+from tests.core.lab import Both, Dice, Frames, Invert, Lab
 
 
 def declared(process: Any) -> type[Stage]:
@@ -533,18 +533,6 @@ FAULTS = {
 def test_an_input_that_cannot_be_wired(lab: Lab, stages, expected):
     text = f"mushpipe: 1\nsource: {{use: frames}}\nstages:\n  {stages}\n"
     assert lab.faults(text) == expected
-
-
-@pytest.mark.parametrize(("stages", "expected"), FAULTS.values(), ids=FAULTS)
-def test_the_program_prints_the_fault_and_ends_with_2(
-    lab: Lab, monkeypatch, capsys, stages, expected
-):
-    monkeypatch.chdir(lab.folder)
-    monkeypatch.setattr("mushpipe.core.plugins.load_registry", lambda: lab.registry)
-    text = f"mushpipe: 1\nsource: {{use: frames}}\nstages:\n  {stages}\n"
-    (lab.folder / "graph.yaml").write_text(text)
-    assert cli(monkeypatch, "run", "graph.yaml") == 2
-    assert capsys.readouterr() == ("", f"error: {expected}\n")
 
 
 def test_inputs_of_a_source_are_refused_in_their_place(lab: Lab):

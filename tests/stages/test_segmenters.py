@@ -54,23 +54,6 @@ def test_an_image_of_one_level_has_no_foreground(stage: Otsu | ChanVese, level: 
     assert not stage.process(frame_of(np.full((120, 160), level))).foreground.any()
 
 
-def test_chan_vese_lowers_the_energy_of_its_start() -> None:
-    rng = np.random.default_rng(1)
-    clean = discs(BED, 0.7, 0.3)
-    frame = frame_of(np.clip(clean + rng.normal(0, 0.15, clean.shape), 0, 1))
-    mask = ChanVese(mu=0.2).process(frame)
-    assert mask.initial is not None
-    assert energy(frame.gray, mask.foreground, 0.2) < 0.9 * energy(frame.gray, mask.initial, 0.2)
-
-
-def energy(gray: np.ndarray, u: np.ndarray, mu: float) -> float:
-    """Chan-Vese energy with the Cauchy-Crofton length on the 8-neighbourhood."""
-    fit = ((gray[u] - gray[u].mean()) ** 2).sum() + ((gray[~u] - gray[~u].mean()) ** 2).sum()
-    axial = (u[1:] != u[:-1]).sum() + (u[:, 1:] != u[:, :-1]).sum()
-    diagonal = (u[1:, 1:] != u[:-1, :-1]).sum() + (u[1:, :-1] != u[:-1, 1:]).sum()
-    return float(fit + mu * np.pi / 8 * (axial + diagonal / np.sqrt(2)))
-
-
 @given(arrays(np.bool_, (20, 23)), st.integers(1, 9))
 def test_opening_is_part_of_the_mask_and_idempotent(image: np.ndarray, size: int) -> None:
     opened = Opening(size=size).process(Mask(image.copy())).foreground
