@@ -37,7 +37,11 @@ ODD = 0.5  # misfit at which is looked whether depth denies the outline:
 DENIED = 4  # in so many of 32 directions, and the circle is put right;
 DENIAL = 0.05  # each counts as so much misfit,
 MENDED = 0.7  # and so much smaller the sum must be in another circle
-COUNTS = 8  # numbers that are kept of a fit, see `fit_circle`
+COUNTS = 8  # numbers that are kept of a fit:
+# how many points, edge rays and outline rays it has, and points of other depth; the sum of the
+# points' weights; the radius of the circle at the cap, m; misfit; and variance of the tilt, rad^2,
+# per direction. Without points there is no fit.
+POINTS, EDGES, LINES, OTHERS, WEIGHT, EXTENT, MISFIT, TILT = range(COUNTS)
 
 
 class Frame(NamedTuple):
@@ -65,7 +69,7 @@ class Settings(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """What is kept of a fit: rays (6, ROOM), parameters (15,) and counts (8,), see `fit_circle`."""
+    """What is kept of a fit: rays (6, ROOM), parameters (15,) and counts (COUNTS,)."""
 
     rays: Singles
     cap: Floats
@@ -189,9 +193,8 @@ def fit_circle(
         rank: Of the circle.
         upright: Unit vector and spread of tilts, rad.
         settings: How.
-        fit: Out: rays (6, ROOM), parameters (15,), and counts (8,) of points, edge rays, outline
-            rays, weight; size, m; misfit; points of other depth; variance of the tilt, rad^2, per
-            direction. Without a fit the counts stay as they are and the misfit is infinite.
+        fit: Out, but for weight and misfit, which `second_fit` adds. Without a fit the counts stay
+            as they are and the misfit is infinite.
         room: From `scratch`.
     """
     _, image, focal = frame
@@ -217,8 +220,8 @@ def fit_circle(
                 take(rays, rival.rays, count, ROOM)
                 put(cap, rival.cap)
     if np.isfinite(misfit):
-        counts[0], counts[1], counts[2], counts[4], counts[6] = n, m, lines, size, other
-        counts[7] = variance
+        counts[POINTS], counts[EDGES], counts[LINES], counts[OTHERS] = n, m, lines, other
+        counts[EXTENT], counts[TILT] = size, variance
     return misfit
 
 
@@ -251,7 +254,8 @@ def fit_cap(
         room: From `scratch`.
     """
     misfit = fit_circle(frame, circle, ranks[0], upright, settings, fit, room)
-    astray = fit.counts[6] > ASTRAY * (fit.counts[0] + fit.counts[6])
+    others = fit.counts[OTHERS]
+    astray = others > ASTRAY * (fit.counts[POINTS] + others)
     if astray or not ODD < misfit < np.inf:
         return
     other, grown, bias = room.other, room.grown, settings.sensor.bias

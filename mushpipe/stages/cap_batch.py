@@ -9,7 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.jit import borrower, jit
-from mushpipe.stages.cap_attempt import COUNTS, POOR, Fit, Frame, Settings, fit_cap, scratch
+from mushpipe.stages.cap_attempt import (
+    COUNTS,
+    EDGES,
+    EXTENT,
+    LINES,
+    MISFIT,
+    OTHERS,
+    POINTS,
+    POOR,
+    TILT,
+    WEIGHT,
+    Fit,
+    Frame,
+    Settings,
+    fit_cap,
+    scratch,
+)
 from mushpipe.stages.cap_blocks import CELLS
 from mushpipe.stages.cap_circle import improve
 from mushpipe.stages.cap_model import (
@@ -34,7 +50,9 @@ from mushpipe.stages.cap_start import spread_of
 ROUNDNESS = 0.01  # in rim radii: how far the rim of a cap is from the circle of its area
 GUESSED = 0.1  # in rim radii: how far off an outline is that no depth edge confirms,
 SEEN = 5  # and with what power of the share that is not confirmed that grows
-TOLD = 11  # numbers that follow from a fit, see `describe`
+TOLD = 11  # numbers that follow from a fit: surface point, m, and
+# where these begin: its sigmas, m; sigma of the tilt, rad, and of the radius, m; the apex, m
+SIGMAS, SIGMA_TILT, SIGMA_RADIUS, APEX = 3, 6, 7, 8
 LEVER = 1.5  # rad of tilt per outline error in rim radii
 
 
@@ -88,29 +106,29 @@ def second_fit(
 ) -> None:  # fmt: skip
     """Refine a fit with what the scene says of its cap's tilt, and then its circle, in place.
 
-    Arguments as `fit_cap`, and out: covariance (8, 8), and what follows from the fit, (11,), as
+    Arguments as `fit_cap`, and out: covariance (8, 8), and what follows from the fit, (TOLD,), as
     `locate` and `describe` fill it. If any of it is not finite, the count of points becomes 0.
     """
     _, image, focal = frame
     (rays, cap, counts), noise = fit, settings.noise
-    count = ROUND + int(counts[0] + counts[1] + counts[2])
-    setting = (noise, 1.0 / focal, counts[4])
-    counts[3], counts[5] = refine(
+    count = ROUND + int(counts[POINTS] + counts[EDGES] + counts[LINES])
+    setting = (noise, 1.0 / focal, counts[EXTENT])
+    counts[WEIGHT], counts[MISFIT] = refine(
         cap, rays, count, upright, setting, STAGES[2], STAGES[3], room.work
     )
     invert(room.work[0][0], covariance)
-    held, doubt = (counts[1], counts[2]), max(1.0, counts[5] / POOR)
+    held, doubt = (counts[EDGES], counts[LINES]), max(1.0, counts[MISFIT] / POOR)
     improve(circle, cap, held, doubt, image.rays, focal, room.lanes)
     ray = ray_at(image.rays, focal, circle[0], circle[1])
     locate(cap, ray, covariance, noise.circle_px / focal, told)
     describe(fit, covariance, told)
-    total = counts[3] + counts[5]
+    total = counts[WEIGHT] + counts[MISFIT]
     for value in cap:
         total += value
     for value in told:
         total += value
-    if not (np.isfinite(total) and counts[3] >= 0.0):
-        counts[0] = 0.0
+    if not (np.isfinite(total) and counts[WEIGHT] >= 0.0):
+        counts[POINTS] = 0.0
 
 
 @jit
@@ -136,19 +154,19 @@ def fit_all(
     for i in range(n):
         fit = Fit(rays[i], caps[i], counts[i])
         fit_cap(frame, circles[i], (rank[i], n), upright, settings, fit, room)
-        if counts[i, 0] > 0:
+        if counts[i, POINTS] > 0:
             first, second = tilt(caps[i], upright[0])
             squares[i] = first * first + second * second
-            variances[i] = counts[i, 7]
+            variances[i] = counts[i, TILT]
     spread_of(squares, variances, upright[1], spreads)
     for i in range(n):
-        if counts[i, 0] > 0:
+        if counts[i, POINTS] > 0:
             improved[i] = circles[i]
             fit, own = Fit(rays[i], caps[i], counts[i]), (upright[0], spreads[i])
             second_fit(frame, improved[i], own, settings, fit, covariances[i], told[i], room)
-        if not counts[i, 0] > 0:
+        if not counts[i, POINTS] > 0:
             improved[i] = circles[i]
-            caps[i], covariances[i], told[i], counts[i, 3] = np.nan, np.nan, np.nan, np.nan
+            caps[i], covariances[i], told[i], counts[i, WEIGHT] = np.nan, np.nan, np.nan, np.nan
 
 
 @borrower
@@ -191,21 +209,20 @@ def describe(fit: Fit, covariance: Floats, told: Floats) -> None:
     Args:
         fit: Of the cap.
         covariance: (8, 8) of it.
-        told: (11,) surface point and its sigmas (m), in and out; sigmas of tilt (rad) and radius
-            (m) and the apex (m), out.
+        told: (TOLD,) surface point and its sigmas, in and out; the rest, out.
     """
     _, cap, counts = fit
-    doubt = max(1.0, counts[5] / POOR)
-    guessed = GUESSED * (1.0 - counts[1] / DIRECTIONS) ** SEEN
-    if counts[6] > ASTRAY * (counts[0] + counts[6]):
-        for i in range(3, 6):
+    doubt = max(1.0, counts[MISFIT] / POOR)
+    guessed = GUESSED * (1.0 - counts[EDGES] / DIRECTIONS) ** SEEN
+    if counts[OTHERS] > ASTRAY * (counts[POINTS] + counts[OTHERS]):
+        for i in range(SIGMAS, SIGMAS + 3):
             told[i] = np.hypot(told[i], cap[RADIUS])
     tilts = covariance[3, 3] + covariance[4, 4] + (LEVER * guessed) ** 2
-    told[6] = doubt * np.sqrt(tilts)
+    told[SIGMA_TILT] = doubt * np.sqrt(tilts)
     outline = (ROUNDNESS**2 + guessed**2) * cap[RADIUS] ** 2
-    told[7] = doubt * np.sqrt(covariance[5, 5] + outline)
+    told[SIGMA_RADIUS] = doubt * np.sqrt(covariance[5, 5] + outline)
     for i in range(3):
-        told[8 + i] = cap[i] + cap[HEIGHT] * cap[N + i]
+        told[APEX + i] = cap[i] + cap[HEIGHT] * cap[N + i]
 
 
 def fit_caps(
@@ -241,21 +258,21 @@ def _fits(
     circles: Floats, caps: Floats, covariances: Floats, told: Floats, counts: Floats, up: Floats
 ) -> Fits:
     return Fits(
-        counts[:, 0] > 0,
-        circles,
-        caps[:, :3],
-        caps[:, N : N + 3],
-        caps[:, RADIUS],
-        caps[:, HEIGHT],
-        told[:, 8:],
-        told[:, :3],
-        covariances,
-        told[:, 6],
-        told[:, 7],
-        told[:, 3:6],
-        np.minimum(counts[:, 3] / len(CELLS), 1.0),
-        counts[:, 1].astype(np.int64),
-        counts[:, 2].astype(np.int64),
-        counts[:, 5],
-        np.arccos(np.clip(caps[:, N : N + 3] @ up, -1, 1)),
+        valid=counts[:, POINTS] > 0,
+        circle=circles,
+        center=caps[:, :3],
+        axis=caps[:, N : N + 3],
+        radius=caps[:, RADIUS],
+        height=caps[:, HEIGHT],
+        apex=told[:, APEX:],
+        surface=told[:, :SIGMAS],
+        covariance=covariances,
+        sigma_tilt=told[:, SIGMA_TILT],
+        sigma_radius=told[:, SIGMA_RADIUS],
+        sigma_surface=told[:, SIGMAS:SIGMA_TILT],
+        fitness=np.minimum(counts[:, WEIGHT] / len(CELLS), 1.0),
+        edges=counts[:, EDGES].astype(np.int64),
+        lines=counts[:, LINES].astype(np.int64),
+        misfit=counts[:, MISFIT],
+        lean=np.arccos(np.clip(caps[:, N : N + 3] @ up, -1, 1)),
     )
