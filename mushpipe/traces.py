@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -17,6 +16,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from mushpipe.core.edges import limited
 from mushpipe.core.errors import InputError, UsageError
+from mushpipe.core.manifest import sha256
 from mushpipe.core.recording import MANIFEST, Index, Raw, RecordingReader
 from mushpipe.core.types import Header, Mask, RgbdFrame, Trace
 from mushpipe.core.wire import (
@@ -75,17 +75,11 @@ def source_recording(results: Path, manifest: Mapping[str, Any]) -> Path | None:
     It counts only with the SHA-256 that the manifest states.
     """
     source = Path(str(manifest.get("graph", {}).get("source", {}).get("path", "")))
-    stated = (manifest.get("recordings") or [{}])[0]
+    played = (manifest.get("recordings") or [{}])[0]
     for path in (source, results.parent / source, results.parent / source.name):
-        if path.is_file() and sha256(path) == stated.get("sha256"):
+        if path.is_file() and sha256(path) == played.get("sha256"):
             return path
     return None
-
-
-def sha256(path: Path) -> str:
-    """Return the SHA-256 of a file, in hexadecimal digits."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def has_results(path: Path) -> bool:
@@ -115,9 +109,9 @@ def read_traces(path: Path, played: Mapping[str, Any] = MappingProxyType({})) ->
     if COLOR_TOPIC not in RecordingReader(path).index().channels and has_results(path):
         found = source_recording(path, manifest)
         if found is None:
-            stated = (manifest.get("recordings") or [{"file": "its recording"}])[0]["file"]
+            name = (manifest.get("recordings") or [{"file": "its recording"}])[0]["file"]
             raise UsageError(
-                f"{path} holds no images, and {stated} is neither at its old place nor beside it"
+                f"{path} holds no images, and {name} is neither at its old place nor beside it"
             )
         # as they were played, but once and at once: what was cut, chosen and calibrated alike
         given = dict(manifest["graph"]["source"])

@@ -33,9 +33,13 @@ def build_manifest(plan: Plan) -> dict[str, Any]:
 def _describe(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {"file": path.name, "sha256": None, "bytes": None}
+    return {"file": path.name, "sha256": sha256(path), "bytes": path.stat().st_size}
+
+
+def sha256(path: Path) -> str:
+    """Return the SHA-256 of a file, in hexadecimal digits."""
     with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return {"file": path.name, "sha256": digest, "bytes": path.stat().st_size}
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _versions(plan: Plan) -> dict[str, str]:

@@ -129,9 +129,16 @@ def evaluate(
         )  # fmt: skip
         raise typer.Exit(_planes(targets, plane, threshold or [], rules, output))
     limit = [] if frames is None else [f"source.max_frames={frames}"]
-    overrides = [*limit, *(set_ or [])]
-    request = Request(targets, truth or [], recordings or [], overrides, matrix or [])
-    request.thresholds, request.topic, request.rules = threshold or [], topic, rules
+    request = Request(
+        targets=targets,
+        truth=truth or [],
+        recordings=recordings or [],
+        overrides=[*limit, *(set_ or [])],
+        matrix=matrix or [],
+        thresholds=threshold or [],
+        topic=topic,
+        rules=rules,
+    )
     raise typer.Exit(_judge(request, out, report, output))
 
 

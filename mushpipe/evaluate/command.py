@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 
@@ -43,18 +43,18 @@ GRAPHS = (".yaml", ".yml")
 Runner = Callable[[Plan], RunReport]
 
 
-@dataclass
+@dataclass(frozen=True)
 class Request:
     """The command line of `mushpipe eval`, apart from how the outcome is shown."""
 
     targets: list[Path]
-    truth: list[Path] = field(default_factory=list)
-    recordings: list[Path] = field(default_factory=list)
-    overrides: list[str] = field(default_factory=list)
-    matrix: list[str] = field(default_factory=list)
-    thresholds: list[str] = field(default_factory=list)
-    topic: str | None = None
-    rules: Rules = field(default_factory=Rules)
+    truth: list[Path]
+    recordings: list[Path]
+    overrides: list[str]
+    matrix: list[str]
+    thresholds: list[str]
+    topic: str | None
+    rules: Rules
 
     def graph(self) -> Path | None:
         """Return the graph among the targets; None where all are results.

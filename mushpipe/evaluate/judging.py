@@ -7,11 +7,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from mushpipe.core.errors import InputError, UsageError
+from mushpipe.core.manifest import sha256
 from mushpipe.evaluate.events import UP, Events, Verdict, comparable, events_of, judge
 from mushpipe.evaluate.metrics import Value, measure
 from mushpipe.evaluate.results import Results, none_found
 from mushpipe.evaluate.truth import Place, TruthSet, has_truth, read_truth
-from mushpipe.traces import sha256, source_recording
+from mushpipe.traces import source_recording
 
 OPTICAL = "the camera's optical frame"  # of labels that name none
 
