@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from mushpipe.core.errors import PluginError
+from mushpipe.core.group import Group
 from mushpipe.core.paths import STDIO, is_written
 from mushpipe.core.types import RgbdFrame
 
@@ -39,13 +40,11 @@ class RunInfo:
         return path
 
 
-class Plugin(BaseModel):
+class Plugin(Group):
     """Base of all plugins: an immutable description whose fields are its settings.
 
     State lives in private attributes only; every run works on a fresh copy.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Set a private attribute; anything else is a mistake of the plugin's author."""

@@ -9,15 +9,14 @@ from typing import Annotated, Any
 
 import numpy as np
 from pydantic import (
-    BaseModel,
     BeforeValidator,
-    ConfigDict,
     Field,
     ValidationError,
     ValidationInfo,
     field_validator,
 )
 
+from mushpipe.core.group import Group
 from mushpipe.core.paths import resolve_path
 from mushpipe.core.tables import Floats
 
@@ -25,10 +24,8 @@ UNIT_TOLERANCE = 1e-3
 REACH = 50.0  # m, of a robot from its camera
 
 
-class Transform(BaseModel):
+class Transform(Group):
     """Takes what is expressed in a source frame to a target frame: p_target = R p_source + t."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     frame: str = Field(min_length=1, max_length=64, description="name of the target frame")
     translation: tuple[float, float, float] = Field(

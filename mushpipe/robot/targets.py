@@ -13,9 +13,10 @@ from typing import Any, Literal
 import numpy as np
 import orjson
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from mushpipe.core.geometry import axis_from_quaternion
+from mushpipe.core.group import Group
 from mushpipe.core.tables import AXIS_TOLERANCE, DepthSource, PickFlag, Picks
 
 Reason = Literal["no_depth", "estimated", "invalid", "workspace", "claimed", "limit"]
@@ -31,10 +32,8 @@ FARTHEST_M, SMALLEST_M = 100.0, 0.0001
 ID_LIMIT = 10**15  # an acknowledgement has no place for more digits
 
 
-class Workspace(BaseModel):
+class Workspace(Group):
     """A box, in the frame the targets are sent in; nothing outside of it is ever sent."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     low: Vector = Field(description="corner with the smallest x, y, z, m")
     high: Vector = Field(description="corner with the largest x, y, z, m")

@@ -5,15 +5,14 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from mushpipe.core.group import Group
 from mushpipe.sim.noise import Singles
 
 
-class ColorCamera(BaseModel):
+class ColorCamera(Group):
     """What a colour camera does to the light: each part can be switched off by its zero."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     exposure: float = Field(0.05, ge=-4, le=4, description="exposure, stops")
     blur: float = Field(0.65, ge=0, le=5, description="blur of the lens, sigma in px")

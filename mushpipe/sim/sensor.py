@@ -18,8 +18,9 @@ from typing import Self
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from mushpipe.core.group import Group
 from mushpipe.sim.material import Paint
 from mushpipe.sim.noise import Floats, Singles, blurred, generator
 from mushpipe.sim.raycast import rays
@@ -50,10 +51,8 @@ class Exact:
     lost: Bools
 
 
-class DepthSensor(BaseModel):
+class DepthSensor(Group):
     """The faults of the depth camera."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     offset_mm: float = Field(2.85, ge=-20, le=20, description="constant error of depth, mm")
     unit_mm: float = Field(0.125, ge=0.01, le=1, description="unit of the depth image, mm")

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from mushpipe import Camera
+from mushpipe.core.group import Group
 
 FOCAL_PX = 617.0  # SR300 colour at 640x480, librealsense issue 10838
 
 
-class SceneSettings(BaseModel):
+class SceneSettings(Group):
     """The scene under the camera: what grows where, in which light."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     scene: Literal["bed", "lab", "plane"] = Field(
         "bed", description="growing bed, printed mushrooms on a table, or a bare plane"

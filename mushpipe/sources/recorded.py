@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from mushpipe.core.geometry import Camera
+from mushpipe.core.group import Group
 from mushpipe.core.stage import Source
 
 NO_DEPTH = "%s has no depth: positions, distances and diameters will be missing"
 NO_CAMERA = "%s has no calibration%s: nothing can be measured in metres"
 
 
-class Intrinsics(BaseModel):
+class Intrinsics(Group):
     """A pinhole camera without distortion, for recordings that carry no calibration."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     fx: float = Field(gt=0, description="focal length along x, px")
     fy: float = Field(gt=0, description="focal length along y, px")
