@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import orjson
+from google.protobuf.message import DecodeError
 from mcap_protobuf.decoder import DecoderFactory
 
 from mushpipe.core import wire
@@ -81,7 +82,7 @@ def compare(
 
     Raises:
         UsageError: There is no such file, or they hold nothing to compare.
-        InputError: One of them cannot be read to its end.
+        InputError: One of them cannot be read to its end, or a message of it not at all.
     """
     result = Comparison()
     readers = RecordingReader(a), RecordingReader(b)
@@ -98,7 +99,7 @@ def compare(
             result.messages += 1
             result.topics.add(key.topic)
             ours, theirs = (raw, partner) if side == 0 else (partner, raw)
-            result.differences += _of_messages(key, ours, theirs, tolerance, limits)
+            result.differences += _of_messages(key, ours, theirs, (a, b), tolerance, limits)
     for reader, rest in zip(readers, waiting, strict=True):
         if reader.damage:
             raise InputError(f"{reader.path} is damaged: {'; '.join(reader.damage)}")
@@ -122,12 +123,27 @@ def _keyed(reader: RecordingReader, topics: str) -> Iterator[tuple[Key, Raw]]:
 
 
 def _of_messages(
-    key: Key, a: Raw, b: Raw, tolerance: float, limits: Mapping[str, float]
+    key: Key,
+    a: Raw,
+    b: Raw,
+    paths: tuple[Path, Path],
+    tolerance: float,
+    limits: Mapping[str, float],
 ) -> Iterator[Difference]:
     if a.message.data == b.message.data and a.channel.metadata == b.channel.metadata:
         return
-    for name, text in _of_fields(_fields(a), _fields(b), tolerance, limits):
+    ours, theirs = (_read(raw, path) for raw, path in zip((a, b), paths, strict=True))
+    for name, text in _of_fields(ours, theirs, tolerance, limits):
         yield Difference(key.topic, name, key.sequence, text)
+
+
+def _read(raw: Raw, path: Path) -> Fields:
+    """Return the fields of a message; a file that was written well may hold any bytes in it."""
+    try:
+        return _fields(raw)
+    except (ValueError, KeyError, TypeError, DecodeError) as error:
+        at = f"a message on {raw.channel.topic}, sequence {raw.message.sequence},"
+        raise InputError(f"{path}: {at} cannot be read: {error}") from error
 
 
 def _of_fields(

@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 
 from mushpipe import InputError, Mask, Picks, Trace
 from mushpipe.core.errors import UsageError
+from mushpipe.core.recorder import RecordingWriter
+from mushpipe.core.wire import TIMING, Message, foxglove_schema
 from mushpipe.proof.compare import _by_path, _difference, _of_fields, compare
 from tests.core.lab import cli
 from tests.io.values import SIZE, make_frame, make_picks, record, trace_of
@@ -142,6 +144,33 @@ def test_a_damaged_file_is_no_basis_for_a_verdict(base: Path, tmp_path: Path) ->
     cut.write_bytes(base.read_bytes()[:-200])
     with pytest.raises(InputError, match=r"cut\.mcap is damaged"):
         compare(base, cut)
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        Message("", TIMING, b'{"score": [0.5, NaN]}'),
+        Message("", TIMING, b""),
+        Message("", foxglove_schema("CameraCalibration"), b"\xff\xfe\xfd"),
+    ],
+)
+def test_a_message_that_cannot_be_read_is_told_of_with_its_file(
+    broken: Message,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Chunks and their CRCs are whole: another writer put it there."""
+    good = b"{}" if broken.schema is TIMING else b""
+    paths = [tmp_path / "good.mcap", tmp_path / "broken.mcap"]
+    for path, data in zip(paths, (good, broken.data), strict=True):
+        writer = RecordingWriter(path, {})
+        writer.write("/other", broken._replace(data=data), make_frame().header)
+        writer.close()
+    for order in (paths, paths[::-1]):
+        assert cli(monkeypatch, "compare", *order) == 4
+        said = " ".join(capsys.readouterr().err.split())
+        assert "broken.mcap: a message on /other, sequence 10, cannot be read" in said
 
 
 def test_the_verb_says_what_differs_and_exits_with_3(
