@@ -67,8 +67,8 @@ class RecordingWriter:
             enable_data_crcs=stream,  # messages without a chunk have no CRC but that of them all
         )
         self._writer.start(profile="mushpipe", library="mushpipe")
-        self._schemas: dict[tuple[str, str], int] = {}
-        self._channels: dict[tuple[str, str, tuple[tuple[str, str], ...]], int] = {}
+        self._schemas: dict[tuple[str, str, bytes], int] = {}
+        self._channels: dict[tuple[str, wire.Schema, tuple[tuple[str, str], ...]], int] = {}
         self._camera: Camera | EllipsisType | None = ...  # nothing was stated yet
         for name, values in metadata.items():
             self.metadata(name, values)
@@ -122,11 +122,12 @@ class RecordingWriter:
 
     def _channel(self, topic: str, message: wire.Message) -> int:
         schema = message.schema
-        key = (topic, schema.name, tuple(sorted(message.metadata.items())))
+        key = (topic, schema, tuple(sorted(message.metadata.items())))
         if key not in self._channels:
-            schema_key = (schema.name, schema.encoding)
+            # Types of two plugins, and of two versions of one, may share a name.
+            schema_key = (schema.name, schema.encoding, schema.data)
             if schema_key not in self._schemas:
-                self._schemas[schema_key] = self._writer.register_schema(*schema_key, schema.data)
+                self._schemas[schema_key] = self._writer.register_schema(*schema_key)
             self._channels[key] = self._writer.register_channel(
                 topic, schema.message_encoding, self._schemas[schema_key], dict(message.metadata)
             )

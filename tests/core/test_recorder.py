@@ -9,7 +9,7 @@ import pytest
 from mushpipe.core.errors import UsageError
 from mushpipe.core.recorder import RecordingError, RecordingWriter
 from mushpipe.core.recording import RecordingReader
-from mushpipe.core.wire import COLOR_TOPIC
+from mushpipe.core.wire import COLOR_TOPIC, json_message, json_schema
 from tests.io.values import make_frame
 
 SIZE = (160, 120)
@@ -93,3 +93,19 @@ def test_a_file_that_is_not_to_be_written_over_is_left_alone(tmp_path: Path) -> 
     with pytest.raises(UsageError, match=r"out\.mcap exists already: give the recording another"):
         RecordingWriter(path, {}, overwrite=False)
     assert path.read_bytes() == before
+
+
+def test_types_of_one_name_keep_their_own_schemas(tmp_path: Path) -> None:
+    """Two plugins may both call a table Marks; on one topic, a recording may hold two versions."""
+    header, path = make_frame(size=SIZE).header, tmp_path / "out.mcap"
+    schemas = [json_schema("mushpipe.Marks", {name: {"type": "integer"}}) for name in "xy"]
+    writer = RecordingWriter(path, {})
+    for topic, schema in zip(("/a", "/b", "/a"), (*schemas, schemas[1]), strict=True):
+        writer.write(topic, json_message(schema, header, {}), header)
+    writer.close()
+    stored = [(raw.channel.topic, raw.schema) for raw in RecordingReader(path).messages()]
+    assert [(topic, schema and schema.data) for topic, schema in stored] == [
+        ("/a", schemas[0].data),
+        ("/b", schemas[1].data),
+        ("/a", schemas[1].data),
+    ]
