@@ -3,6 +3,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -166,3 +167,46 @@ def test_a_row_that_loses_one_end_and_gains_the_other_has_not_shifted_by_a_pitch
     ids(tracks, *row[:3])
     assert ids(tracks, *row[1:3], at=1) == [1, 2]
     assert ids(tracks, *row[1:], at=2) == [1, 2, 3]
+
+
+def dense(seed: int) -> np.ndarray:
+    """Return centres (N, 2) in an image of 640x480 of caps with a radius of 24 that do not overlap.
+
+    The outer ones stay in the image however the camera turns.
+    """
+    points = np.random.default_rng(seed).uniform(-230, 230, (600, 2))
+    kept: list[np.ndarray] = []
+    for point in points[np.hypot(*points.T) < 230]:
+        if all(np.hypot(*(point - other)) > 46 for other in kept):
+            kept.append(point)
+    return np.array(kept)
+
+
+@pytest.mark.parametrize("z", [0.5, np.nan])
+@pytest.mark.parametrize("degrees", [10, 45, 180])
+def test_after_a_turn_no_mushroom_gets_the_id_of_another(degrees: float, z: float) -> None:
+    """A cap that happens to come where another one was must not be done because that one is."""
+    turn = np.exp(1j * np.radians(degrees))
+    for seed in range(4):
+        bed = dense(seed)
+        turned = bed @ np.array([[turn.real, turn.imag], [-turn.imag, turn.real]])
+        tracks, found = Tracks(), []
+        for step, places in enumerate((bed, turned, turned)):
+            rows = [(u + 320, v + 240, z) for u, v in places]
+            now = tracks.update(*seen(*rows, radius=24), (640, 480), step, 10**9)
+            found.append(now.tolist())
+        assert len(bed) > 25
+        assert not set(found[0]) & set(found[1])
+        assert found[2] == found[1]
+
+
+def test_the_few_that_an_arm_leaves_in_view_keep_their_ids_whatever_is_found_on_it() -> None:
+    bed = dense(1) + np.array([320, 240])
+    left = bed[bed[:, 0] < np.sort(bed[:, 0])[4]]
+    on_arm = [(400.0 + 60 * i, 90.0 + 70 * i, 0.3) for i in range(6)]
+    tracks = Tracks()
+    first = tracks.update(*seen(*((u, v, 0.5) for u, v in bed), radius=24), (640, 480), 0, 10**9)
+    rows = [*((u, v, 0.5) for u, v in left), *on_arm]
+    now = tracks.update(*seen(*rows, radius=24), (640, 480), 1, 10**9).tolist()
+    assert now[:4] == [first[i] for i in range(len(bed)) if bed[i, 0] in left[:, 0]]
+    assert not set(now[4:]) & set(first.tolist())
