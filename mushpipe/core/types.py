@@ -22,6 +22,15 @@ COLOR_FRAME = "camera_color_optical_frame"
 """The frame of the colour images, and of aligned depth, by realsense2_camera's name."""
 
 
+def end_of_scale(depth: NDArray[Any]) -> np.float32:
+    """Return the native value from which on depth is missing; infinity of floats.
+
+    The last of an integer says at most that something is at least so far away.
+    """
+    last = np.iinfo(depth.dtype).max if depth.dtype.kind == "u" else np.inf
+    return np.float32(last)
+
+
 @dataclass(frozen=True)
 class Header:
     """Where and when a frame was taken.
@@ -64,7 +73,8 @@ class RgbdFrame:
     Attributes:
         header: Time, number and frame.
         color: (H, W, 3) uint8 RGB.
-        depth: (H, W) uint16 or float32 in the sensor's unit, 0 = missing; None without depth.
+        depth: (H, W) uint16 or float32 in the sensor's unit, 0 = missing, as is the last number of
+            uint16 (see `end_of_scale`); None without depth.
         depth_scale: Metres per unit of `depth`.
         camera: Intrinsics of the colour image; None where the recording has none.
         attached: What else is known of this moment, by topic, and recorded beside the images; the
@@ -116,14 +126,16 @@ class RgbdFrame:
     def depth_m(self) -> NDArray[np.float32]:
         """(H, W) float32 depth in metres, NaN = missing (everywhere without depth), read-only.
 
-        What no camera measures (100 km and more) is missing as well.
+        What no camera measures (100 km and more, the end of its scale) is missing as well.
         """
         if self.depth is None:
             return locked(np.full(self.color.shape[:2], np.nan), np.float32)
         import cv2
 
-        metres = self.depth * np.float32(self.depth_scale)
-        known = (metres > 0) & (metres < _FARTHEST_M)
+        unit = np.float32(self.depth_scale)
+        metres = self.depth * unit
+        farthest = np.minimum(np.float32(_FARTHEST_M), end_of_scale(self.depth) * unit)
+        known = (metres > 0) & (metres < farthest)
         # three times as fast as to assign where it is not known
         missing = np.full(metres.shape, np.nan, np.float32)
         return locked(cv2.copyTo(metres, known.view(np.uint8), missing), np.float32)

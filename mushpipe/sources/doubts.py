@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.types import RgbdFrame
+from mushpipe.core.types import RgbdFrame, end_of_scale
 
 logger = logging.getLogger("mushpipe")
 FARTHEST_M = 30.0
@@ -22,8 +22,8 @@ def warned(name: str, frame: RgbdFrame) -> bool:
     """Warn of a recording's depth where it is odd; return whether there is any to be judged by."""
     if frame.depth is None:
         return False
-    depth = frame.depth[::8, ::8] * frame.depth_scale
-    known = depth[np.isfinite(depth) & (depth > 0)]
+    depth = frame.depth[::8, ::8]
+    known = depth[(depth > 0) & (depth < end_of_scale(depth))] * frame.depth_scale
     for doubt in doubts(known):
         logger.warning("%s, frame %d: %s", name, frame.header.sequence, doubt)
     return len(known) > 0

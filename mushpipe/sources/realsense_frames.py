@@ -18,7 +18,7 @@ from mushpipe.core.errors import InputError
 from mushpipe.core.geometry import Camera
 from mushpipe.core.libraries import import_realsense
 from mushpipe.core.tables import Columns, column
-from mushpipe.core.types import COLOR_FRAME, Header, RgbdFrame
+from mushpipe.core.types import COLOR_FRAME, Header, RgbdFrame, end_of_scale
 from mushpipe.core.wire import Message
 from mushpipe.sources.images import decode_color
 from mushpipe.sources.realsense_device import camera_of
@@ -158,8 +158,9 @@ class FrameMaker:
         depth = np.array(self._align.process(frames).get_depth_frame().get_data(), np.uint16)
         if self._gain is None:
             return depth
-        moved = np.clip(np.rint((depth + self._shift) * self._gain), 0, 65535)
-        return np.where(depth > 0, moved, 0).astype(np.uint16)
+        end = end_of_scale(depth)
+        moved = np.clip(np.rint((depth + self._shift) * self._gain), 0, end)
+        return np.where((depth > 0) & (depth < end), moved, 0).astype(np.uint16)
 
     def _header(self, color: Any, arrival_ns: int) -> Header:
         whole_ms, rest_ms = divmod(color.get_timestamp(), 1)

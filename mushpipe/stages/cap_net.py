@@ -16,6 +16,7 @@ from mushpipe.core.errors import UsageError
 from mushpipe.core.jit import borrower
 from mushpipe.core.onnx_file import OnnxFile
 from mushpipe.core.tables import locked
+from mushpipe.core.types import end_of_scale
 from mushpipe.stages.cap_decode import (
     CHANNELS,
     MASK,
@@ -221,7 +222,7 @@ def _depth_seen(frame: RgbdFrame) -> float | None:
     if frame.depth is None:
         return None
     depth = frame.depth[::8, ::8]
-    known = depth[(depth > 0) & np.isfinite(depth)]
+    known = depth[(depth > 0) & (depth < end_of_scale(depth))]
     if len(known) < _LEAST_KNOWN * depth.size:
         return None
     return float(np.median(known)) * frame.depth_scale

@@ -14,6 +14,7 @@ from mushpipe import GraphPath, InputError, RgbdFrame, Stage
 from mushpipe.core.document import read_document
 from mushpipe.core.errors import GraphError
 from mushpipe.core.jit import jit
+from mushpipe.core.types import end_of_scale
 from mushpipe.stages.warm_up import example_frame
 
 Plane = NDArray[np.float32]
@@ -72,20 +73,24 @@ class DepthCorrect(Stage):
         if frame.depth is None:
             return frame
         errors = np.array(self._errors, np.float32) / np.float32(1000)
-        return replace(frame, depth=corrected(frame.depth, frame.depth_scale, errors))
+        depth, scale = frame.depth, frame.depth_scale
+        return replace(frame, depth=corrected(depth, scale, errors, end_of_scale(depth)))
 
 
 @jit
-def corrected(depth: NDArray[Any], scale: float, errors: NDArray[np.float32]) -> Plane:
+def corrected(
+    depth: NDArray[Any], scale: float, errors: NDArray[np.float32], end: np.float32
+) -> Plane:
     """Take a polynomial with coefficients from the constant on (m) off depth in units of scale (m).
 
-    What is missing, or not above 0 afterwards, is 0.
+    What is missing, from the end of the scale on, or not above 0 afterwards, is 0.
     """
     out = np.empty(depth.shape, np.float32)
     unit, per_m = np.float32(scale), np.float32(1 / scale)
     for y in range(depth.shape[0]):
         for x in range(depth.shape[1]):
-            z = np.float32(depth[y, x]) * unit
+            value = np.float32(depth[y, x])
+            z = value * unit if value < end else np.float32(0)
             left = z - (errors[0] + z * (errors[1] + z * errors[2]))
             out[y, x] = left * per_m if z > 0 and 0 < left < np.inf else np.float32(0)
     return out

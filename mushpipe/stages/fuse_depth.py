@@ -11,6 +11,7 @@ from pydantic import Field, PrivateAttr
 
 from mushpipe import RgbdFrame, Stage
 from mushpipe.core.jit import jit
+from mushpipe.core.types import end_of_scale
 
 Singles = NDArray[np.float32]
 SIGMAS = 4.0  # of depth noise, which the gate lets pass
@@ -53,7 +54,7 @@ class FuseDepth(Stage):
             depth = np.ones((2, 2), dtype)
             depth.flags.writeable = False
             state = np.zeros((2, 2), np.float32), np.zeros((2, 2), np.uint8)
-            fuse(depth, *state, np.zeros((2, 2), np.uint8), (1.0, 0.0, 0.0), 2)
+            fuse(depth, *state, np.zeros((2, 2), np.uint8), (1.0, 0.0, 0.0, 9.0), 2)
         self._mean = None
 
     def process(self, frame: RgbdFrame) -> RgbdFrame:
@@ -74,7 +75,8 @@ class FuseDepth(Stage):
         self._stamp_ns = frame.header.stamp_ns
         noise = SIGMAS * self.depth_noise_mm / 1000 / frame.depth_scale
         growth = SIGMAS * self.depth_noise_per_m / 1000
-        gate = (self.gate_mm / 1000 / frame.depth_scale, noise, growth)
+        end = float(end_of_scale(depth))
+        gate = (self.gate_mm / 1000 / frame.depth_scale, noise, growth, end)
         fresh, known = fuse(depth, self._mean, self._count, self._age, gate, self.frames)
         if fresh > self.moved * known:
             self._forget(frame)
@@ -89,8 +91,8 @@ class FuseDepth(Stage):
 
 @jit
 def fuse(
-    depth: NDArray[Any], mean: Any, count: Any, age: Any, gate: tuple[float, float, float],
-    frames: int,
+    depth: NDArray[Any], mean: Any, count: Any, age: Any,
+    gate: tuple[float, float, float, float], frames: int,
 ) -> Any:  # fmt: skip
     """Take one more depth image into a mean.
 
@@ -100,7 +102,8 @@ def fuse(
         count: (H, W) uint8, in and out, how many frames each mean holds.
         age: (H, W) uint8, in and out, for how many frames each pixel had no depth.
         gate: Step at which a pixel starts anew, native: at least the first, and at least the second
-            plus the third times its depth.
+            plus the third times its depth. The fourth is where depth ends, native: from there on
+            it is missing.
         frames: Most frames that a mean holds.
 
     Returns:
@@ -110,7 +113,7 @@ def fuse(
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
             z = np.float32(depth[v, u])
-            if z <= 0:
+            if z <= 0 or z >= gate[3]:
                 if mean[v, u] > 0:
                     age[v, u] += 1
                     if age[v, u] >= frames:

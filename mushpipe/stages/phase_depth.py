@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 
 from mushpipe import RgbdFrame
 from mushpipe.core.jit import inlined, jit
+from mushpipe.core.types import end_of_scale
 from mushpipe.stages.bed import far_cells, fit_plane, plane_depth
 from mushpipe.stages.phase_edges import Edges, Plane, depth_edges
 
 CELL = 2  # px of the image per px of the height map
 GRID = 16  # px of the height map per cell of the bed's fit
 FILL = 8  # px of the height map: widest gap that is closed for edges
+FARTHEST = np.float32(1e9)  # native; beyond is no depth
 STEEP = 1.0  # slope of an edge, height over length
 
 
@@ -26,18 +28,18 @@ def halved(depth: NDArray[Any], scale: float) -> Plane:
     odd = depth.shape[0] % 2, depth.shape[1] % 2
     if any(odd):  # a row that stands twice changes no mean
         depth = np.pad(depth, ((0, odd[0]), (0, odd[1])), mode="edge")
-    return _halved(depth, scale)
+    return _halved(depth, scale, min(FARTHEST, end_of_scale(depth)))
 
 
 @inlined
-def _if_known(value: Any) -> Any:
+def _if_known(value: Any, end: np.float32) -> Any:
     """Return 1 for a depth, 0 where there is none: a comparison is false for NaN too."""
-    known = (value > np.float32(0)) & (value < np.float32(1e9))
+    known = (value > np.float32(0)) & (value < end)
     return np.float32(1) if known else np.float32(0)
 
 
 @jit
-def _halved(depth: NDArray[Any], scale: float) -> Plane:
+def _halved(depth: NDArray[Any], scale: float, end: np.float32) -> Plane:
     """Do the work of `halved` for an even size; without branches, so that SIMD does it."""
     height, width = depth.shape[0] // 2, depth.shape[1] // 2
     out = np.empty((height, width), np.float32)
@@ -47,7 +49,8 @@ def _halved(depth: NDArray[Any], scale: float) -> Plane:
         for x in range(width):
             a, b = np.float32(above[2 * x]), np.float32(above[2 * x + 1])
             c, d = np.float32(below[2 * x]), np.float32(below[2 * x + 1])
-            i, j, k, n = _if_known(a), _if_known(b), _if_known(c), _if_known(d)
+            i, j = _if_known(a, end), _if_known(b, end)
+            k, n = _if_known(c, end), _if_known(d, end)
             total = (a if i > none else none) + (b if j > none else none)
             total += (c if k > none else none) + (d if n > none else none)
             count = i + j + k + n

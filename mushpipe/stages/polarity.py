@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe import RgbdFrame
+from mushpipe.core.types import end_of_scale
 from mushpipe.stages.linear import least_squares
 
 _STEP = 8
@@ -20,9 +21,10 @@ def rise(frame: RgbdFrame, region: NDArray[np.bool_]) -> float:
     """
     if frame.depth is None:
         return float("nan")
-    depth = frame.depth[::_STEP, ::_STEP] * frame.depth_scale
+    native = frame.depth[::_STEP, ::_STEP]
+    depth = native * frame.depth_scale
     inside = region[::_STEP, ::_STEP]
-    v, u = np.nonzero((depth > 0) & np.isfinite(depth))
+    v, u = np.nonzero((native > 0) & (native < end_of_scale(native)))
     member = inside[v, u]
     if min(member.sum(), (~member).sum()) < _FEWEST:
         return float("nan")

@@ -78,9 +78,9 @@ def test_a_frame_that_cannot_be(changes, message):
 
 
 def test_depth_in_metres_from_sensor_units():
-    native = np.array([[0, 1, 8000, 65535]], np.uint16)
-    frame = RgbdFrame(HEADER, np.zeros((1, 4, 3), np.uint8), native, 0.000125)
-    expected = [np.nan, 0.000125, 1.0, 8.191875]
+    native = np.array([[0, 1, 8000, 65534, 65535]], np.uint16)
+    frame = RgbdFrame(HEADER, np.zeros((1, 5, 3), np.uint8), native, 0.000125)
+    expected = [np.nan, 0.000125, 1.0, 8.19175, np.nan]  # the last one says that it ran over
     assert frame.depth_m.dtype == np.float32
     np.testing.assert_allclose(frame.depth_m[0], expected, rtol=1e-6)
 

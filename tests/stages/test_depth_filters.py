@@ -94,6 +94,15 @@ def test_nan_is_missing_and_no_depth_passes() -> None:
     assert DepthCorrect(offset_mm=3).process(frame(None)).depth is None
 
 
+@pytest.mark.parametrize("stage", [FuseDepth(), DepthCorrect(offset_mm=2.0)])
+def test_depth_at_the_end_of_its_scale_is_missing(stage: FuseDepth | DepthCorrect) -> None:
+    depth = np.full(SHAPE, 4000, np.uint16)
+    depth[3, 4] = 65535
+    out = stage.process(frame(depth, 0.000125)).depth_m
+    assert np.isnan(out[3, 4])
+    assert np.isfinite(out).sum() == depth.size - 1
+
+
 def test_correction_takes_the_polynomial_off_and_keeps_the_unit() -> None:
     depth = np.full(SHAPE, 4000, np.uint16)
     depth[0, 0] = 0
