@@ -147,6 +147,11 @@ class Camera:
                 "k4 k5 k6 after these"
             )
 
+    @property
+    def centred(self) -> bool:
+        """Whether the principal point lies within the image."""
+        return 0 <= self.cx < self.width and 0 <= self.cy < self.height
+
     def project(self, points: Array) -> Array:
         """Project (..., 3) points in metres to (..., 2) pixels.
 

@@ -155,8 +155,9 @@ def decode_camera(message: Any, rectified: bool) -> Camera | None:
             for them then, not K and D.
 
     Raises:
-        ValueError: The distortion model is one that is not implemented, a number is not finite, or
-            the calibration says not for which size of image it is.
+        ValueError: The distortion model is one that is not implemented, a number is not finite, the
+            matrix has more in it than a pinhole camera, or the calibration says not for which size
+            of image it is.
     """
     k = list(message.k if hasattr(message, "k") else message.K)
     d = distortion(message)
@@ -165,6 +166,8 @@ def decode_camera(message: Any, rectified: bool) -> Camera | None:
         k = [*p[:3], *p[4:7], *p[8:11]] if len(p) == 12 and p[0] > 0 else k
     if len(k) != 9 or not (k[0] > 0 and k[4] > 0):
         return None
+    if any((k[1], k[3], k[6], k[7])):  # sheared, or written column by column
+        raise ValueError(f"its matrix is no fx 0 cx, 0 fy cy, 0 0 1, but {[float(v) for v in k]}")
     if not (message.width and message.height):
         raise ValueError(
             f"a calibration for images of {message.width}x{message.height} px: give source.camera: "

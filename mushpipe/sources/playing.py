@@ -79,7 +79,7 @@ class Player:
         self._calibrated = ""  # frame of the calibration
         self._stated = False  # whether there was a calibration, or word that there is none
         self._judged = False  # whether there was depth to be judged
-        self._warned = False  # that a lens is left out
+        self._warned: set[str] = set()
         self._found_beside: dict[tuple[int, int], dict[str, wire.Message]] = {}
 
     def wanted(self) -> set[str]:
@@ -155,22 +155,35 @@ class Player:
             self._calibrated = _stamp(message, raw)[1]
             if "image_rect_raw" in name and any(distortion(message)):
                 self._warn_rectified()  # realsense2_camera's name, also where it rectified nothing
-            return decode_camera(message, rectified)
+            camera = decode_camera(message, rectified)
+            if camera is not None and not camera.centred:
+                self._warn_off_centre(camera)
+            return camera
 
         self.camera, self._stated = self._decode(raw, decode, what), True
         return self.camera
 
     def _warn_rectified(self) -> None:
-        """Say, once, that a lens is left out."""
-        if not self._warned:
-            self._warned = True
-            logger.warning(
-                "%s: %s is called rectified, so the distortion that its calibration states is not "
-                "applied; if the images are as the lens made them, positions near their corners "
-                "are off by some mm",
-                self.name,
-                self.topics.color,
-            )
+        """Say that a lens is left out."""
+        self._warn(
+            f"{self.topics.color} is called rectified, so the distortion that its calibration "
+            "states is not applied; if the images are as the lens made them, positions near their "
+            "corners are off by some mm"
+        )
+
+    def _warn_off_centre(self, camera: Camera) -> None:
+        """Say that a calibration may be that of other images; of a part of one it may be right."""
+        self._warn(
+            f"the principal point of the calibration ({self.topics.camera}), ({camera.cx:g}, "
+            f"{camera.cy:g}), lies outside of the image, which is {camera.width}x{camera.height}; "
+            "if the images were made smaller, positions are off: set source.camera"
+        )
+
+    def _warn(self, text: str) -> None:
+        """Say something once."""
+        if text not in self._warned:
+            self._warned.add(text)
+            logger.warning("%s: %s", self.name, text)
 
     def _decode(
         self, raw: Raw, decode: Callable[[Any, Raw], T | None], what: str = "images"

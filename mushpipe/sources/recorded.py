@@ -36,12 +36,13 @@ class Intrinsics(Group):
                 f"the image is {here}, the first one {first[1]}x{first[0]}: source.camera holds "
                 "for images of one size"
             )
-        if not (0 <= self.cx < size[1] and 0 <= self.cy < size[0]):
+        camera = Camera(size[1], size[0], self.fx, self.fy, self.cx, self.cy)
+        if not camera.centred:
             raise ValueError(
                 f"the principal point of source.camera, ({self.cx:g}, {self.cy:g}), lies outside "
                 f"of the image, which is {here}: intrinsics for that size are expected"
             )
-        return Camera(size[1], size[0], self.fx, self.fy, self.cx, self.cy)
+        return camera
 
 
 class RecordedSource(Source):

@@ -152,6 +152,29 @@ def test_a_calibration_without_a_size_of_image_is_refused(tmp_path: Path) -> Non
         list(source.frames())
 
 
+@pytest.mark.parametrize(
+    "k", [(FX, 0, 0, 0, FY, 0, CX, CY, 1), (FX, 5, CX, 0, FY, CY, 0, 0, 1)], ids=["turned", "skew"]
+)
+def test_a_matrix_that_is_no_pinholes_is_refused(k: tuple[float, ...], tmp_path: Path) -> None:
+    """Read as if it were, the first puts the principal point into the corner of the image."""
+    frames, error = drain(McapSource(path=write_bag(tmp_path, [info_at(0, k=k), *COLORS])))
+    assert [frame.camera for frame in frames] == [None] * 3
+    assert "its matrix is no fx 0 cx, 0 fy cy, 0 0 1, but [617.5" in str(error)
+
+
+def test_a_principal_point_outside_of_the_image_is_told_of_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As where images were made smaller and their calibration was not."""
+    for i, cx in enumerate((CX, WIDTH + 0.5)):
+        infos = [info_at(n, k=(FX, 0, cx, 0, FY, CY, 0, 0, 1)) for n in range(3)]
+        found = cameras(tmp_path / str(i), [*infos, *COLORS])
+        assert [camera and camera.cx for camera in found] == [cx] * 3
+        said = [r.getMessage() for r in caplog.records if "principal point" in r.getMessage()]
+        assert len(said) == i
+    assert "(8.5, 2.25), lies outside of the image, which is 8x6" in said[0]
+
+
 def test_a_calibration_that_changes_is_followed(tmp_path: Path) -> None:
     entries = [info_at(0), color_at(0), info_at(1, k=(99, 0, 1, 0, 99, 1, 0, 0, 1)), color_at(1)]
     found = cameras(tmp_path, entries)
