@@ -18,17 +18,17 @@ from mcap.records import (
     Attachment,
     Channel,
     Chunk,
+    ChunkIndex,
     DataEnd,
     McapRecord,
     Metadata,
     Schema,
-    Statistics,
 )
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
-from mcap.summary import Summary
 from zstandard import ZstdError
 
+from mushpipe.core.chunks import by_log_time, require_complete, side_by_side
 from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.truth import TABLE
 
@@ -80,6 +80,7 @@ class Index:
     end_ns: int = 0
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     attachments: list[str] = field(default_factory=list)
+    side_by_side: list[ChunkIndex] = field(default_factory=list)  # chunks, if they are
 
     def schema_name(self, topic: str) -> str:
         """Return the name of a topic's schema, empty where it has none."""
@@ -99,8 +100,8 @@ def _table(channel: Channel, schema: Schema | None) -> str:
 class RecordingReader:
     """Reads an MCAP file from front to back, chunk by chunk, checking the CRC of each.
 
-    Messages come in file order, sorted by log time within a chunk. ``damage`` says afterwards,
-    in words, what could not be read.
+    Messages come in file order, sorted by log time within a chunk, and from chunk to chunk where
+    these lie side by side in time. ``damage`` says afterwards, in words, what could not be read.
 
     Raises:
         UsageError: There is no such file, or it is a pipe.
@@ -139,7 +140,7 @@ class RecordingReader:
     ) -> Iterator[Raw]:
         """Yield the messages of some topics (default all) with start_ns <= log_time < end_ns.
 
-        They come by log time within each chunk, or in the order in which they were written.
+        They come by log time, see above, or in the order in which they were written.
         """
         index, seen = self.index(), 0
         # A chunk that is skipped or corrupt may be the one that declares them.
@@ -148,11 +149,13 @@ class RecordingReader:
         def wanted(time: int) -> bool:
             return time >= start_ns and (end_ns is None or time < end_ns)
 
-        def overlaps(chunk: Chunk) -> bool:
+        def overlaps(chunk: Chunk | ChunkIndex) -> bool:
             past = end_ns is not None and chunk.message_start_time >= end_ns
             return chunk.message_end_time >= start_ns and not past
 
-        for record in self._records(overlaps, as_written):
+        turned = bool(index.side_by_side) and not as_written
+        records = self._by_log_time(overlaps) if turned else self._records(overlaps, as_written)
+        for record in records:
             if isinstance(record, Schema):
                 schemas[record.id] = record
             elif isinstance(record, Channel):
@@ -196,7 +199,13 @@ class RecordingReader:
             except GARBAGE:
                 self._note("it breaks off: the recorder did not close it, or bytes are missing")
 
-    def _unpack(self, chunk: Chunk, as_written: bool) -> list[McapRecord]:
+    def _by_log_time(self, wanted: Callable[[ChunkIndex], bool]) -> Iterator[McapRecord]:
+        try:
+            yield from by_log_time(self.path, self.index().side_by_side, wanted, self._unpack)
+        except GARBAGE as error:
+            self._note(f"a chunk is not where its index says ({error})")
+
+    def _unpack(self, chunk: Chunk, as_written: bool = False) -> list[McapRecord]:
         try:
             if chunk.uncompressed_size > 2**32:
                 raise ValueError("implausible size")
@@ -248,7 +257,7 @@ class RecordingReader:
             summary = reader.get_summary()
             if summary is None or summary.statistics is None:
                 raise ValueError("no summary")
-            _require_complete(summary, summary.statistics)
+            require_complete(summary, summary.statistics)
             counts: Counter[str] = Counter()
             for channel_id, count in summary.statistics.channel_message_counts.items():
                 counts[summary.channels[channel_id].topic] += count
@@ -261,6 +270,7 @@ class RecordingReader:
                 end_ns=summary.statistics.message_end_time,
                 metadata={m.name: m.metadata for m in reader.iter_metadata()},
                 attachments=[a.name for a in summary.attachment_indexes],
+                side_by_side=side_by_side(file, summary.chunk_indexes),
             )
 
     def _index_by_scan(self) -> Index:
@@ -282,15 +292,3 @@ class RecordingReader:
             elif isinstance(record, Attachment):
                 index.attachments.append(record.name)
         return index
-
-
-def _require_complete(summary: Summary, statistics: Statistics) -> None:
-    """Raise ValueError where a summary leaves out what it may: then the file has to be read."""
-    stated = {
-        "counts": bool(statistics.channel_message_counts) or not statistics.message_count,
-        "schemas": all(c.schema_id in (0, *summary.schemas) for c in summary.channels.values()),
-        "metadata": statistics.metadata_count == len(summary.metadata_indexes),
-        "attachments": statistics.attachment_count == len(summary.attachment_indexes),
-    }
-    if missing := [name for name, whole in stated.items() if not whole]:
-        raise ValueError(f"the summary lacks {', '.join(missing)}")

@@ -183,3 +183,52 @@ def test_a_message_of_no_channel_is_noticed(tmp_path):
     reader = RecordingReader(path)
     assert times(reader) == []
     assert "a message belongs to no channel" in reader.damage
+
+
+def topic_by_topic(path: Path, *logged: tuple[str, int], each: int = 2) -> Path:
+    """Messages in this order, ``each`` to a chunk."""
+    writer = Writer(str(path), compression=CompressionType.NONE)
+    writer.start()
+    channels = {topic: writer.register_channel(topic, "json", 0) for topic, _ in logged}
+    for number, (topic, time) in enumerate(logged, 1):
+        writer.add_message(channels[topic], log_time=time, data=b"{}", publish_time=time)
+        if number % each == 0:
+            writer.flush()
+    writer.finish()
+    return path
+
+
+@pytest.mark.parametrize("each", [1, 2, 3, 7])
+def test_messages_come_by_time_where_chunks_hold_one_topic_after_the_other(tmp_path, each):
+    """Colour and depth do not find each other where all of one comes before all of the other."""
+    logged = [("/a", 10 + 2 * i) for i in range(10)] + [("/b", 11 + 2 * i) for i in range(10)]
+    reader = RecordingReader(topic_by_topic(tmp_path / "x.mcap", *logged, each=each))
+    assert times(reader) == list(range(10, 30))
+    assert times(reader, {"/b"}, 12, 16) == [13, 15]
+    assert [raw.message.log_time for raw in reader.messages(as_written=True)][:3] == [10, 12, 14]
+    assert reader.damage == []
+
+
+def test_messages_of_one_time_come_in_the_order_of_the_file(tmp_path):
+    logged = [("/a", 1), ("/a", 5), ("/b", 1), ("/b", 5), ("/c", 5), ("/c", 5)]
+    reader = RecordingReader(topic_by_topic(tmp_path / "x.mcap", *logged))
+    found = [(raw.channel.topic, raw.message.log_time) for raw in reader.messages()]
+    assert found == [("/a", 1), ("/b", 1), ("/a", 5), ("/b", 5), ("/c", 5), ("/c", 5)]
+
+
+def test_where_a_clock_was_set_back_the_order_of_the_file_stays(tmp_path):
+    logged = [("/a", 10), ("/b", 11), ("/a", 20), ("/b", 21), ("/a", 12), ("/b", 13)]
+    reader = RecordingReader(topic_by_topic(tmp_path / "x.mcap", *logged))
+    assert times(reader) == [10, 11, 20, 21, 12, 13]
+
+
+def test_a_corrupt_chunk_among_such_is_left_out_and_the_others_are_read(tmp_path):
+    logged = [("/a", 10), ("/a", 12), ("/b", 11), ("/b", 13)]
+    path = topic_by_topic(tmp_path / "x.mcap", *logged)
+    data = bytearray(path.read_bytes())
+    _, end = chunks(bytes(data))[0]
+    data[end - 3] ^= 1
+    path.write_bytes(data)
+    reader = RecordingReader(path)
+    assert times(reader) == [11, 13]
+    assert [text for text in reader.damage if text.startswith("a chunk is corrupt")]
