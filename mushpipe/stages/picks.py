@@ -24,7 +24,9 @@ _ONE_CHAIN = (
     "circles, locations and poses must come from one chain; what sorts or filters circles belongs "
     "before the localizer"
 )
-ASTRAY = 3.0  # radii; the apex of a leaning cap is seen up to two from the middle of its circle
+# Radii from the middle of its circle: a location is seen there, the apex of a leaning cap up to two
+# away. Neighbours are apart by two where they touch.
+ASTRAY = {"location": 1.0, "pose": 3.0}
 Rank = Literal["unoccluded", "highest", "largest", "score"]
 FlagName = Literal[
     "depth_missing",
@@ -208,13 +210,16 @@ class MakePicks(Stage):
 
 
 def _require_same(
-    circles: Circles, points: NDArray[np.float64], what: str, frame: RgbdFrame
+    circles: Circles,
+    points: NDArray[np.float64],
+    what: Literal["location", "pose"],
+    frame: RgbdFrame,
 ) -> None:
     """Raise ValueError where a point (N, 3) is not seen in its circle: rows were mixed up."""
     if frame.camera is None:
         return
     seen = frame.camera.project(points)
-    away = np.linalg.norm(seen - circles.center, axis=1) > ASTRAY * circles.radius
+    away = np.linalg.norm(seen - circles.center, axis=1) > ASTRAY[what] * circles.radius
     if away.any():
         row = int(np.flatnonzero(away)[0])
         (u, v), (x, y) = circles.center[row], seen[row]

@@ -105,6 +105,22 @@ def test_locations_of_other_circles_are_refused() -> None:
         MakePicks().process(frame_of(np.zeros((120, 160))), circles_at((50, 50), (80, 50)), found)
 
 
+def test_locations_of_two_neighbours_that_changed_places_are_refused() -> None:
+    """Sorted by score behind the localizer, say: each would have the other's score and outline."""
+    found = locations(DepthSource.MEASURED, DepthSource.MEASURED, at=(66, 50))
+    circles = circles_at((50, 50), (66, 50))
+    with pytest.raises(ValueError, match=r"row 0: the circle is at \(50, 50\), its location at"):
+        MakePicks().process(frame_of(np.zeros((120, 160))), circles, found)
+    assert (
+        len(
+            MakePicks().process(
+                frame_of(np.zeros((120, 160))), circles, found.take(np.array([1, 0]))
+            )
+        )
+        == 2
+    )
+
+
 def test_poses_of_other_circles_are_refused() -> None:
     found = locations(DepthSource.MEASURED, DepthSource.MEASURED)
     poses = Poses(
