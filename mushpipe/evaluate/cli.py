@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import tempfile
 import threading
@@ -201,8 +202,8 @@ def _up(gravity: str) -> tuple[float, ...]:
         up = tuple(-float(part) for part in gravity.split(","))
     except ValueError:
         up = ()
-    if len(up) != 3 or not sum(x * x for x in up) > 0:
-        raise UsageError(f"--gravity {gravity}: expected X,Y,Z, not all 0")
+    if len(up) != 3 or not 0 < sum(x * x for x in up) < math.inf:
+        raise UsageError(f"--gravity {gravity}: expected X,Y,Z, finite and not all 0")
     return up
 
 

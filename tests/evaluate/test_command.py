@@ -458,7 +458,8 @@ def test_matrix_compares_on_the_same_frames(graph: Path, tmp_path: Path) -> None
 def test_options_that_need_a_graph_say_so(perfect: Path) -> None:
     result = run(perfect, "--matrix", "a.b=1,2")
     assert isinstance(result.exception, UsageError)
-    assert isinstance(run(perfect, "--gravity", "0,0,0").exception, UsageError)
+    for gravity in ("0,0,0", "inf,0,1", "nan,0,1"):
+        assert isinstance(run(perfect, "--gravity", gravity).exception, UsageError)
     assert isinstance(run(perfect, "--topic", "/mushpipe/pik").exception, UsageError)
 
 
