@@ -148,6 +148,12 @@ class RobotJsonSink(Sink):
         ports = " and ".join(map(str, self._server.ports))
         kind = "live" if run.live else "a recording, marked as such"
         logger.info("robots are served at %s, port %s: %s", self.bind, ports, kind)
+        if _count(run.manifest) > 1:
+            logger.warning(
+                "what robots at port %s accept is offered at the graph's other sink robot-json all "
+                "the same: serve robots that share a bed by one sink, with abb_port if need be",
+                ports,
+            )
 
     def _observe(self, kind: Kind, client: int, text: bytes) -> None:
         if self._transcript is not None:
@@ -259,6 +265,12 @@ def _is_of_host(header: Header, sensor: SensorClock | None) -> bool:
     if sensor is not None:
         return bool(sensor.domain[0] != Domain.HARDWARE)
     return 0 <= header.arrival_ns - header.stamp_ns <= SAME_CLOCK_NS
+
+
+def _count(manifest: Mapping[str, Any]) -> int:
+    """Return how many sinks like this one a run has; each keeps a ledger of its own."""
+    sinks = manifest.get("graph", {}).get("sinks", {}).values()
+    return sum(sink["use"].rpartition(":")[-1] == "robot-json" for sink in sinks)
 
 
 def _is_loopback(address: str) -> bool:

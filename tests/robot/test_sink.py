@@ -83,6 +83,17 @@ def test_a_recording_is_not_served_unless_the_graph_says_so(sink: RobotJsonSink)
         sink.open(RunInfo("test", {}))
 
 
+@pytest.mark.parametrize("second", ["robot-json", "mcap"])
+def test_two_sinks_that_know_nothing_of_each_others_claims_say_so(
+    sink: RobotJsonSink, caplog: pytest.LogCaptureFixture, second: str
+) -> None:
+    """Two robots would go for one mushroom, each with an `acked`."""
+    sinks = {"left": {"use": "robot-json"}, "right": {"use": second}}
+    sink.open(replace(LIVE, manifest={"graph": {"sinks": sinks}}))
+    told = f"what robots at port {port(sink)} accept is offered at the graph's other sink"
+    assert (told in caplog.text) == (second == "robot-json")
+
+
 @pytest.mark.parametrize("address", ["0.0.0.0", "::", "192.0.2.1"])
 def test_the_network_is_not_served_without_token_or_tls(address: str) -> None:
     with pytest.raises(UsageError, match="open to the network"):
