@@ -63,6 +63,14 @@ def test_a_part_of_something_larger_is_none() -> None:
     assert not ((inner > 70) & (inner < 250)).any()
 
 
+def test_a_low_cap_is_parted_from_the_stem_that_it_leans_on() -> None:
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    stem = np.hypot((2 * u - 140) / 85, (2 * v - 120) / 44) <= 1
+    height = np.maximum(disc(100, 120, 40, 0.034), np.where(stem, 0.024, 0.0))
+    found = blobs_of(relief(height), 8, 60)
+    assert (np.abs(found[:, :3] - (100, 120, 40)).max(axis=1) <= EXACT).any()
+
+
 @pytest.mark.parametrize("level", [-1.0, 0.0, 0.003, 0.05])
 def test_what_is_all_of_one_height_or_unknown_holds_none(level: float) -> None:
     assert blobs_of(relief(np.full((HEIGHT, WIDTH), level)), 8, 60).shape == (0, 4)

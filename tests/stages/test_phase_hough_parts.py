@@ -8,7 +8,7 @@ import pytest
 from mushpipe import Mask
 from mushpipe.stages.bed import far_cells, fit_plane, plane_depth
 from mushpipe.stages.discs import lens
-from mushpipe.stages.phase_decide import outline_features, overlap_features
+from mushpipe.stages.phase_decide import decide, outline_features, overlap_features
 from mushpipe.stages.phase_depth import GRID, closed, halved, relief_of
 from mushpipe.stages.phase_edges import edges_of, gradient_of, otsu_of
 from mushpipe.stages.phase_features import (
@@ -24,6 +24,7 @@ from mushpipe.stages.phase_scratch import scratch_for
 from mushpipe.stages.phase_strips import Strips, in_strips
 from mushpipe.stages.phase_verifier import load_verifier
 from mushpipe.stages.phase_votes import GAP, peaks, phase_of, rings_between, summed, vote
+from mushpipe.stages.verifier_net import Models
 from tests.stages.scenes import discs, frame_of, sphere_depth
 
 ALL = np.ones((120, 160), np.uint8)
@@ -259,3 +260,20 @@ def test_every_candidate_has_all_features_and_a_probability() -> None:
     assert np.isfinite(found.table).all()
     assert ((chance >= 0) & (chance <= 1)).all()
     assert set(owner.tolist()) <= {-1, *range(len(order))}
+
+
+@pytest.mark.parametrize("likely", [True, False])
+def test_of_likely_rivals_the_one_that_a_network_agrees_with_comes_first(likely: bool) -> None:
+    """Of unlikely ones it does not: what they are is no more than a guess."""
+    image = discs([(40, 60, 15), (62, 60, 14), (90, 40, 12)], 0.8, 0.15)
+    found = PhaseHough().gather(frame_of(image), Mask(image > 0.5))
+    assert found is not None
+    n = len(found.shapes)
+    found.table[:, NAMES.index(LEARNED)] = np.linspace(0.9, 0.2, n)
+    alike = Models(*(np.zeros_like(part) for part in load_verifier()))
+    logit = np.float32(0.4 if likely else -0.4)
+    alike = alike._replace(scale=alike.scale + 1, b3=alike.b3 + logit)
+    which = np.zeros(n, np.int32)
+    order, _, _ = decide(found.edges, found.shapes, found.hits, found.table, which, alike, 0.3)
+    first_agreed, last_given = list(range(n)), list(range(n))[::-1]
+    assert order.tolist() == (first_agreed if likely else last_given)
