@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, field_validator
 
 from mushpipe import Circles, DepthSource, Locations, PickFlag, Picks, Poses, RgbdFrame, Stage
+from mushpipe.core.errors import UsageError
 from mushpipe.core.transform import Transform, TransformSetting
 from mushpipe.stages.surroundings import clearance, hidden_share
 from mushpipe.stages.tracks import Tracks
@@ -109,6 +110,7 @@ class MakePicks(Stage):
 
         Raises:
             ValueError: The inputs differ in their number of rows, or are of different circles.
+            UsageError: `T_base_camera` names the camera's frame for the robot's.
         """
         n = len(circles)
         poses = Poses.unknown(n) if poses is None else poses
@@ -132,6 +134,11 @@ class MakePicks(Stage):
         picks = _joined(ids, circles, locations, poses, flags, frame.header.frame_id)
         up = -locations.position[:, 2]
         if self.T_base_camera is not None:
+            if self.T_base_camera.frame == picks.frame_id:
+                raise UsageError(
+                    f"T_base_camera.frame is '{picks.frame_id}', the camera's own: name the frame "
+                    "of the robot that the picks are to be in, such as robot_base"
+                )
             picks = in_base(picks, self.T_base_camera)
             up = picks.surface[:, 2]
         picks = replace(picks, sigma_position=_sigma_position(picks))

@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from mushpipe import Circles, DepthSource, Locations, PickFlag, Picks, Poses
+from mushpipe.core.errors import UsageError
 from mushpipe.stages.picks import MakePicks
 from mushpipe.stages.surroundings import hidden_share
 from tests.stages.scenes import CAMERA, frame_of
@@ -384,3 +385,11 @@ def test_poses_of_no_rows_are_refused() -> None:
     circles, found = circles_at((50, 50), (80, 50)), locations(*[DepthSource.MEASURED] * 2)
     with pytest.raises(ValueError, match="2 circles, 2 locations, 0 poses"):
         MakePicks().process(frame_of(np.zeros((120, 160))), circles, found, Poses.unknown(0))
+
+
+def test_picks_in_the_robots_frame_cannot_have_the_cameras_name() -> None:
+    circles, found = circles_at((50, 50)), locations(DepthSource.MEASURED)
+    own = {"frame": "camera_color_optical_frame", "translation": [0, 0, 1]}
+    stage = MakePicks(T_base_camera=own | {"quaternion": [1, 0, 0, 0]})
+    with pytest.raises(UsageError, match="frame is 'camera_color_optical_frame'"):
+        stage.process(frame_of(np.zeros((120, 160))), circles, found)
