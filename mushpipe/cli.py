@@ -258,8 +258,10 @@ def main() -> None:
     except MushpipeError as error:
         sys.stderr.write(f"error: {error}\n")
         sys.exit(error.exit_code)
-    except BrokenPipeError:
-        sys.stderr.close()
+    except SystemExit as ended:
+        # Who reads our output may have read enough (`| head`), which typer calls a failure.
+        if not isinstance(ended.__context__, BrokenPipeError):
+            raise
         sys.exit(0)
     except OSError as error:  # a full disk, a folder that may not be written to
         sys.stderr.write(f"error: {error.filename or 'output'}: {error.strerror or error}\n")

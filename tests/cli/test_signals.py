@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -68,3 +69,13 @@ def test_where_native_code_crashes_is_told(tmp_path: Path) -> None:
     ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert ended.returncode == -signal.SIGABRT
     assert f'File "{tmp_path / "say.py"}", line 6 in process' in ended.stderr
+
+
+def test_who_reads_our_output_may_have_read_enough() -> None:
+    """As `| head` does, which is no failure of ours."""
+    read, write = os.pipe()
+    os.close(read)
+    command = [sys.executable, "-m", "mushpipe", "plugins", "list"]
+    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (0, "")
