@@ -16,6 +16,7 @@ from mushpipe.core.errors import GraphError, PluginError, Problem, suggest
 from mushpipe.core.faults import faults_of
 from mushpipe.core.overrides import apply_override, encoding_fault
 from mushpipe.core.overwriting import same_file
+from mushpipe.core.paths import from_home
 from mushpipe.core.plan import Node, Plan
 from mushpipe.core.plugins import Registry, in_file
 from mushpipe.core.ports import OF_SOURCE, ports_of
@@ -128,6 +129,8 @@ def _entries(document: Document) -> dict[Kind, list[tuple[Location, dict[str, An
 
 
 def _replace_source(document: Document, source: str, registry: Registry) -> None:
+    label = f"--source {source}"
+    source = str(from_home(source)) if source.startswith("~") else source
     name = source.rpartition(":")[2]  # which may say whose it is
     is_name = ("source", name) in registry.entries and not Path(source).is_file()
     given = {"use": "mcap", "path": source}
@@ -149,7 +152,6 @@ def _replace_source(document: Document, source: str, registry: Registry) -> None
             names = ", ".join(kept)
             document.warnings.append(f"--source keeps the graph's {names}; --set changes that")
     document.data["source"] = given
-    label = f"--source {source}"
     document.overrides[("source",)] = label
     for key in ("use", "path", "file"):
         if key in given:
@@ -249,7 +251,7 @@ def _node(
         message = f"the settings of '{use}' cannot be written into a graph and read again: {fault}"
         problems.append(document.problem((*at, "use"), message))
     if in_file(use):
-        use = str((base / use).resolve())
+        use = str((base / from_home(use)).resolve())
     attributes = settings_of(plugin_class)
     paths = {
         key: str(value)

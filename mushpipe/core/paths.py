@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Union, get_args, get_origin
@@ -16,10 +17,22 @@ STDIO = Path("-")
 """In place of a file: standard output."""
 
 
+def from_home(path: str | Path) -> Path:
+    """Return a path whose leading ``~`` is the home folder.
+
+    Shells leave it as it is in ``--set log.path=~/x.mcap``, and nobody is there to expand it in a
+    graph file: a folder called ``~`` was made.
+    """
+    with suppress(RuntimeError):  # of no user is it the home: a file may be called ~x
+        return Path(path).expanduser()
+    return Path(path)
+
+
 def resolve_path(path: Path, info: ValidationInfo) -> Path:
     """Return a path of a setting, relative to the graph file or to the shell; a validator."""
     if path == STDIO:
         return path
+    path = from_home(path)
     context = info.context or {}
     from_shell = info.field_name in context.get("from_shell", ())
     whole = Path("" if from_shell else context.get("base", "")) / path

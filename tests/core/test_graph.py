@@ -421,6 +421,29 @@ def test_paths_are_relative_to_the_graph_file_unless_the_shell_gives_them(lab: L
     assert str(absolute) == "/data/bed.mcap"
 
 
+def test_a_tilde_is_the_home_folder_which_no_shell_puts_into_a_setting(
+    lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    lab.registry.source("mcap", "mushpipe.sources.mcap:McapSource")
+    lab.registry.source("images", "mushpipe.sources.folder:ImagesSource")
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "mine.py").write_text(
+        "from mushpipe import Mask, RgbdFrame, Stage\n"
+        "class Mine(Stage):\n"
+        "    def process(self, frame: RgbdFrame) -> Mask: ...\n"
+    )
+    graph = "mushpipe: 1\nsource: {use: mcap, path: ~/bed.mcap}\nstages: {a: {use: threshold}}\n"
+    plan = lab.compile(graph, "a.use=~/mine.py:Mine")
+    assert plan.source.plugin.path == tmp_path / "bed.mcap"
+    assert plan.stages[0].use == f"{tmp_path}/mine.py:Mine"
+    given = lab.compile(graph, "source.path=~/other.mcap").source.plugin.path
+    assert given == tmp_path / "other.mcap"
+    assert lab.compile(graph, source="~/photos").source.plugin.path == tmp_path / "photos"
+    odd = lab.compile(graph, "source.path=~no-user.mcap").source.plugin.path
+    assert str(odd) == "~no-user.mcap"
+
+
 def test_above_a_link_is_what_it_leads_to_as_in_the_shell(tmp_path: Path) -> None:
     real, link = tmp_path / "station/graphs", tmp_path / "graphs"
     real.mkdir(parents=True)
