@@ -55,6 +55,8 @@ def record(
     split_size: SplitOption = None,
 ) -> None:
     """Record a source until it ends or Ctrl-C; what cannot be kept is counted and told."""
+    import logging
+
     from mushpipe.console import execute, set_up_logging
     from mushpipe.core.errors import UsageError
     from mushpipe.core.paths import STDIO
@@ -73,6 +75,8 @@ def record(
     if out == STDIO and split_size is not None:
         raise UsageError("--split-size: a stream cannot be split")
     plan = _compile(settings, [*overrides, *(set_ or [])], source)
+    for text in plan.warnings:
+        logging.getLogger("mushpipe").warning(text)
     _refuse_to_overwrite(plan)
     size = None if out == STDIO else lambda: sum(path.stat().st_size for path in _files(plan))
     report = execute(plan, None, Path("failures"), size)

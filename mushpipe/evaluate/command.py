@@ -219,7 +219,10 @@ def _judge_graph(
     played: list[tuple[Path | None, str]] = [(None, "")]
     if recordings:
         played = [*zip(recordings, unique_names(recordings), strict=True)]
-    for option, number, plan in plans(graph, recordings, request.overrides, options, folder):
+    runs = plans(graph, recordings, request.overrides, options, folder)
+    for text in dict.fromkeys(text for *_, plan in runs for text in plan.warnings):
+        logger.warning(text)
+    for option, number, plan in runs:
         report = runner(plan)
         require_results(report)
         if report.error is not None:

@@ -112,7 +112,7 @@ def bench(
     spare(out, *files_read(plan))
     now = conditions(_endless(plan, frames, speed))
     before = read_baseline(baseline, now) if baseline else None
-    for text in changes(now, before) if before else ():
+    for text in (*plan.warnings, *(changes(now, before) if before else ())):
         logging.getLogger("mushpipe").warning(text)
     with TemporaryDirectory(prefix="mushpipe-bench-") as folder:
         plan = plan.into(Path(folder))  # results of a run stay as they are

@@ -220,6 +220,25 @@ def test_errors_name_what_is_wrong(
     assert not (folder / "out.mcap").exists()
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["run", "graph.yaml", "--source", "realsens"],
+        ["record", "--source", "realsens", "-o", "x.mcap"],
+        ["bench", "graph.yaml", "realsens"],
+        ["eval", "graph.yaml", "--recordings", "realsens", "--truth", "labels.json"],
+    ],
+)
+def test_every_verb_that_plays_tells_what_a_graph_is_warned_of(
+    folder: Path, arguments: list[str]
+) -> None:
+    (folder / "labels.json").write_text('{"mushpipe_labels": 1, "frames": []}')
+    done = mushpipe(*arguments, cwd=folder)
+    warning = "'realsens' is neither a file nor a source; did you mean 'realsense'?\n"
+    assert done.stderr.count(warning) == 1
+    assert done.returncode == EXIT_USAGE
+
+
 def test_a_failing_stage_leaves_a_capsule_that_fails_again(folder: Path) -> None:
     (folder / "mine.py").write_text(
         "from mushpipe import Mask, RgbdFrame, Stage\n\n"
