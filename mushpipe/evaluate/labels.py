@@ -19,6 +19,10 @@ Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 Reason = Literal[
     "hidden", "too-small", "too-large", "at-border", "not-upright", "cut-stump", "ambiguous"
 ]
+EXAMPLE = (
+    '{"mushpipe_labels": 1, "frames": [{"index": 0, "caps": '
+    '[{"u": 320.5, "v": 201.0, "radius_px": 24.5}]}]}'
+)
 SHORTEST = 1e-6  # length of an axis that points somewhere
 _STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -115,10 +119,15 @@ def convert(document: Json) -> Json:
             try:
                 frames = reader(document)
             except (KeyError, TypeError, ValueError) as error:
-                raise ValueError(f"labels with '{key}': {error!r}") from error
+                fault = f"{error} is missing" if isinstance(error, KeyError) else repr(error)
+                raise ValueError(
+                    f"labels with '{key}', and without mushpipe_labels so of a foreign layout: "
+                    f"{fault}; expected is {EXAMPLE}"
+                ) from error
             note = document.get("note", document.get("rule", ""))
             return {"mushpipe_labels": 1, "note": note, "frames": frames}
-    raise ValueError(f"no labels: none of mushpipe_labels, {', '.join(readers)}")
+    known = ", ".join(readers)
+    raise ValueError(f"none of mushpipe_labels, {known} is in it; expected is {EXAMPLE}")
 
 
 def _must_find(document: Json) -> list[Json]:

@@ -17,7 +17,7 @@ from mushpipe.core.tables import Floats
 from mushpipe.core.truth import TRUTH_TOPIC, Truth
 from mushpipe.core.types import Header
 from mushpipe.core.wire import decode_table
-from mushpipe.evaluate.labels import Frame, parse_labels, truth_of
+from mushpipe.evaluate.labels import EXAMPLE, Frame, parse_labels, truth_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +133,9 @@ def truth_of_labels(path: Path) -> TruthSet:
     except ValidationError as error:
         faults = [f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()]
         raise InputError("\n  ".join([f"{path}: not valid labels:", *faults[:20]])) from error
+    except orjson.JSONDecodeError as error:  # a table (CSV), say
+        text = f"{path}: no labels: not JSON ({error}); expected is {EXAMPLE}"
+        raise InputError(text) from error
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: no labels: {error}") from error
     frames = {_place(frame): _frame_truth(path, frame, labels.frame_id) for frame in labels.frames}

@@ -16,7 +16,7 @@ from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.recording import MANIFEST
 from mushpipe.core.truth import TRUTH_TOPIC, Ignore
 from mushpipe.evaluate.judging import Rules, judge_results
-from mushpipe.evaluate.labels import convert
+from mushpipe.evaluate.labels import EXAMPLE, convert, parse_labels
 from mushpipe.evaluate.results import Results, of_picks
 from mushpipe.evaluate.truth import FrameTruth, TruthSet, has_truth, read_truth
 from mushpipe.sources.mcap import McapSource
@@ -118,6 +118,7 @@ def test_conversion_leaves_the_own_format_alone() -> None:
         ({"boxes": []}, "none of mushpipe_labels"),
         ({"must_find": [{"cx": 1}]}, "must_find"),
         ({"frames": [{"caps": []}]}, "stamp_ns"),
+        ({"frames": [{"index": 0, "caps": []}]}, "without mushpipe_labels .*'stamp_ns' is missing"),
         ({"mushpipe_labels": 1, "frames": [{"index": 0, "caps": [{"u": 1}]}]}, "frames.0.caps.0.v"),
         ({"mushpipe_labels": 1, "frames": [{"caps": []}]}, "either stamp_ns or index"),
         ({"mushpipe_labels": 2, "frames": []}, "mushpipe_labels"),
@@ -204,6 +205,13 @@ def test_files_that_are_not_there_or_no_json(tmp_path: Path) -> None:
     (tmp_path / "bad.json").write_text("{")
     with pytest.raises(InputError, match="no labels"):
         read_truth(tmp_path / "bad.json")
+    (tmp_path / "hand.csv").write_text("file,x,y,r\n0.png,320.5,201,24.5\n")
+    with pytest.raises(InputError, match=r"hand\.csv: no labels: not JSON .*; expected is {"):
+        read_truth(tmp_path / "hand.csv")
+
+
+def test_the_example_in_messages_is_labels() -> None:
+    assert parse_labels(json.loads(EXAMPLE)).frames[0].caps[0].u == 320.5
 
 
 def test_truth_of_a_recording(tmp_path: Path) -> None:
