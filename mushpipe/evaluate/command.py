@@ -258,8 +258,8 @@ def _with_truth(recordings: list[Path]) -> list[Path]:
 
 def _require_judged(evaluation: Evaluation) -> None:
     if not evaluation.verdicts:
-        names = ", ".join(judged.truth.name for judged in evaluation.recordings)
-        raise InputError(f"no frame of the results is labelled in {names}")
+        places = ", ".join(judged.places() for judged in evaluation.recordings)
+        raise InputError(f"no frame of the results is labelled in {places}")
 
 
 def _section(evaluation: Evaluation) -> Section:

@@ -45,6 +45,14 @@ class Judged:
     verdicts: list[Verdict] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
+    def places(self) -> str:
+        """Name the truth, with the first frame in it and those that the run looked at."""
+        for kind, value in self.truth.frames:
+            if seen := self.results.span("sequence" if kind == "index" else kind):
+                known = f"{seen[0]} to {seen[-1]}"
+                return f"{self.truth.name}: there {kind} {value} comes first, results have {known}"
+        return self.truth.name
+
 
 @dataclass
 class Evaluation:

@@ -252,6 +252,22 @@ def test_a_recording_whose_only_label_is_of_a_frame_that_failed_counts(
     assert metrics(content)["recall"] == 0.5
 
 
+def test_labels_of_other_frames_are_told_apart_from_those_of_the_results(
+    perfect: Path, tmp_path: Path
+) -> None:
+    labels = tmp_path / "other.json"
+    frame = {"caps": [{"u": 1.0, "v": 1.0, "radius_px": 9.0}]}
+    for place, first, known in (
+        ("index", 77, "0 to 2"),
+        ("stamp_ns", 5, f"{header(0).stamp_ns} to {header(2).stamp_ns}"),
+    ):
+        labels.write_text(json.dumps({"mushpipe_labels": 1, "frames": [{place: first, **frame}]}))
+        assert str(run(perfect, "--truth", labels).exception) == (
+            "no frame of the results is labelled in other.json: "
+            f"there {place} {first} comes first, results have {known}"
+        )
+
+
 def test_results_that_lost_all_their_picks_say_so(tmp_path: Path, truths: dict[int, Any]) -> None:
     """The channel is there, its messages are not, and neither is word of how the run went."""
     schema = table_schema(Picks)
