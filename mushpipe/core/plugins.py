@@ -31,6 +31,8 @@ logger = logging.getLogger("mushpipe")
 
 GROUP = "mushpipe"
 _MORE = "\n\nFor further information visit"  # pydantic's pages, in each of its errors
+# files that stand in a traceback before those of a plugin that is imported
+_LOADERS = ("<frozen ", __file__, *importlib.__path__, *pluggy.__path__)
 hookspec = pluggy.HookspecMarker(GROUP)
 hookimpl = pluggy.HookimplMarker(GROUP)
 
@@ -217,7 +219,19 @@ def _owner(point: EntryPoint) -> tuple[str, str]:
 
 
 def _brief(error: BaseException) -> str:
-    return f"{type(error).__name__}: {str(error).partition(_MORE)[0]}"
+    return f"{type(error).__name__}: {str(error).partition(_MORE)[0]}{_place(error)}"
+
+
+def _place(error: BaseException) -> str:
+    """Return the line of the plugin's own module at which an error came up, as Python writes it."""
+    if isinstance(error, SyntaxError):  # it names its line itself
+        return ""
+    steps = traceback.extract_tb(error.__traceback__)
+    files = [(Path(step.filename), step.lineno) for step in steps]
+    files = [each for each in files if not str(each[0]).startswith(_LOADERS)]
+    # what it calls in other packages is not where it has to be changed
+    own = [each for each in files if each[0].parent == files[0][0].parent]
+    return f" ({own[-1][0].name}, line {own[-1][1]})" if own else ""
 
 
 def _import(target: str) -> Any:

@@ -184,7 +184,8 @@ def test_faults_of_a_graph_are_printed_together_with_places(folder: Path) -> Non
         (
             ["plugins", "describe", "broken.py:Mine"],
             EXIT_USAGE,
-            "broken.py cannot be imported: TypeError: 'int' object is not a mapping\n",
+            "broken.py cannot be imported: TypeError: 'int' object is not a mapping "
+            "(broken.py, line 1)\n",
         ),
         (
             ["export", "results.mcap", "--topic", "/picks"],

@@ -133,7 +133,7 @@ def test_the_program_quotes_a_broken_package_where_a_graph_asks_for_its_name(
     assert cli(monkeypatch, "validate", graph) == 2
     error = capsys.readouterr().err
     assert error.startswith(f"error: {graph}:3:19: unknown stage 'fungify-all'; known: ")
-    reason = "which failed to load: ZeroDivisionError: division by zero\n"
+    reason = "which failed to load: ZeroDivisionError: division by zero (__init__.py, line 1)\n"
     assert f"it may belong to fungus 1.2, {reason}" in error
 
 
@@ -307,6 +307,22 @@ def test_a_file_that_cannot_be_used(lab: Lab, code, use, message):
         path.write_text(code)
     text = lab.faults(f"mushpipe: 1\nsource: {{use: frames}}\nstages:\n  a: {{use: {use}}}\n")
     assert text.startswith("graph.yaml:4:12: " + message.format(file=path))
+
+
+@pytest.mark.parametrize(
+    ("code", "line"),
+    [
+        (HEADER + "class X(Stage):\n    sizes = []\n", HEADER.count("\n") + 1),  # pydantic raises
+        ("def size():\n    return 1 / 0\n\nX = size()\n", 2),
+        ("\nimport no_such_module\n", 2),
+        ("\n\ndef\n", 3),
+    ],
+)
+def test_a_file_that_cannot_be_imported_is_told_with_the_line(lab: Lab, code: str, line: int):
+    (lab.folder / "mine.py").write_text(code)
+    with pytest.raises(PluginError) as caught:
+        find(lab.registry, "mine.py:X", lab.folder)
+    assert str(caught.value).endswith(f" (mine.py, line {line})")
 
 
 def test_a_file_with_a_plugin_of_another_kind(lab: Lab):
