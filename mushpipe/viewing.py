@@ -43,6 +43,8 @@ def figure(
     from mushpipe.traces import read_manifest, read_trace
 
     set_up_logging(False)
+    if not out.suffix:  # matplotlib would write another file, out.png
+        raise UsageError(f"{out}: expected the kind of image in its name: {out}.png, say")
     spare(out, results)
     require_writable(out)
     trace = read_trace(results, frame)

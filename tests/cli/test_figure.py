@@ -192,3 +192,7 @@ def test_the_command_writes_an_image(tmp_path: Path) -> None:
         assert image.std() > 10
     wrong = CliRunner().invoke(app, ["figure", str(results), "--frame", "10", "-o", "a.xyz"])
     assert isinstance(wrong.exception, UsageError)
+    bare = tmp_path / "stages"
+    wrong = CliRunner().invoke(app, ["figure", str(results), "--frame", "10", "-o", str(bare)])
+    assert isinstance(wrong.exception, UsageError)
+    assert str(wrong.exception).endswith(f"expected the kind of image in its name: {bare}.png, say")
