@@ -154,7 +154,7 @@ class Registry:
         for other in ("stage", "source", "sink"):
             if (other, use) in self.entries:
                 text = f"'{use}' is a {other}, not a {kind}"
-        if narrowed := os.environ.get("MUSHPIPE_PLUGINS"):
+        if (narrowed := os.environ.get("MUSHPIPE_PLUGINS")) is not None:  # "" leaves out all
             text += f"\n    only plugins of MUSHPIPE_PLUGINS={narrowed} are loaded"
         for broken in self.broken:
             text += (

@@ -185,9 +185,10 @@ def test_whose_plugin_is_meant_may_be_written_as_pip_takes_it(site, use):
     assert find(load_registry(), use).__module__ == "My_Fungus"
 
 
-def test_an_unknown_name_may_be_left_out_by_the_environment(site, monkeypatch):
-    monkeypatch.setenv("MUSHPIPE_PLUGINS", "no-such-thing")
-    with pytest.raises(PluginError, match="only plugins of MUSHPIPE_PLUGINS=no-such-thing are"):
+@pytest.mark.parametrize("wanted", ["no-such-thing", ""])
+def test_an_unknown_name_may_be_left_out_by_the_environment(site, monkeypatch, wanted):
+    monkeypatch.setenv("MUSHPIPE_PLUGINS", wanted)
+    with pytest.raises(PluginError, match=f"only plugins of MUSHPIPE_PLUGINS={wanted} are"):
         load_registry().find("stage", "nothing-here", Path())
 
 
