@@ -130,12 +130,14 @@ def _who_produces(registry: Registry, port: Port) -> str:
     """Return a hint that names the stages producing a type; only asked when one is missing."""
     able = []
     for name in registry.names("stage"):
-        for entry in registry.entries["stage", name]:
+        entries = registry.entries["stage", name]
+        for entry in entries:
             try:
                 outputs = ports_of(entry.load()).outputs
             except MushpipeError:
                 continue
-            able += [name] if any(issubclass(t, port.type) for t in outputs) else []
+            use = name if len(entries) == 1 else f"{entry.distribution}:{name}"
+            able += [use] if any(issubclass(t, port.type) for t in outputs) else []
     return f"stages that produce {port.type.__name__}: {', '.join(able) or 'none installed'}"
 
 

@@ -27,7 +27,7 @@ from mushpipe import (
 from mushpipe.core.errors import PluginError
 from mushpipe.core.plan import Link
 from mushpipe.core.ports import Port, Ports, ports_of
-from tests.core.lab import Both, Dice, Frames, Invert, Lab
+from tests.core.lab import Both, Dice, Frames, Invert, Lab, Threshold, cli
 
 
 def declared(process: Any) -> type[Stage]:
@@ -575,6 +575,13 @@ def test_a_type_that_no_plugin_produces(lab: Lab):
     lab.registry.stage("broken", "no_such_module:X")
     text = "mushpipe: 1\nsource: {use: frames}\nsinks:\n  r: {use: robot}\n"
     assert lab.faults(text).endswith("stages that produce Picks: none installed")
+
+
+def test_of_a_name_that_two_packages_have_both_ways_to_write_it_are_told(lab: Lab):
+    lab.registry._owner = ("fungus", "1.2")
+    lab.registry.stage("threshold", Threshold)
+    hint = "stages that produce Mask: both, invert, this process:threshold, fungus:threshold"
+    assert hint in lab.faults(lab.chain("invert"))
 
 
 def test_a_stage_that_lacks_its_library_does_not_hide_the_fault(lab: Lab, monkeypatch):
