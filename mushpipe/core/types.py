@@ -105,6 +105,8 @@ class RgbdFrame:
     def _check_depth(self, depth: NDArray[Any]) -> None:
         if depth.dtype not in (np.uint16, np.float32):
             raise ValueError(f"depth is {depth.dtype}, expected uint16 or float32")
+        if depth.ndim != 2:
+            raise ValueError(f"depth has shape {depth.shape}, expected one channel: (H, W)")
         if depth.shape != self.color.shape[:2]:
             raise ValueError(
                 f"depth has shape {depth.shape}, colour {self.color.shape[:2]}: "

@@ -62,6 +62,10 @@ def test_a_frame_is_locked():
             "depth has shape (2, 3), colour (4, 6): depth must be aligned to colour",
         ),
         (
+            {"depth": np.zeros((4, 6, 3), np.uint16)},
+            "depth has shape (4, 6, 3), expected one channel: (H, W)",
+        ),
+        (
             {"depth": np.zeros((4, 6), np.uint16), "depth_scale": 0},
             "depth_scale is 0, expected metres per unit > 0",
         ),
