@@ -67,7 +67,10 @@ def recordings_in(paths: Sequence[Path]) -> list[Path]:
     for path in paths:
         files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
         if not files:
-            raise UsageError(f"{path}: the folder holds no recordings (*.mcap)")
+            raise UsageError(
+                f"{path}: the folder holds no recordings (*.mcap); one of images is played by a "
+                "graph whose source is 'images', or after mushpipe record --source FOLDER -o X.mcap"
+            )
         found += files
     return found
 

@@ -446,6 +446,12 @@ def test_recordings_may_follow_the_graph_and_folders_are_opened(
     assert only["overall"]["frames"] == 3
 
 
+def test_a_folder_without_recordings_may_be_one_of_images(graph: Path, tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    told = str(run(graph, "--recordings", tmp_path / "photos").exception)
+    assert "photos: the folder holds no recordings (*.mcap); one of images is played by" in told
+
+
 def test_results_of_alternatives_never_share_a_file(graph: Path, tmp_path: Path) -> None:
     options = [Alternative(f"net.model={value}") for value in ("a/b.onnx", "a_b.onnx", "c.onnx")]
     runs = plans(graph, [tmp_path / "bed.mcap"], (), options, tmp_path / "out")
