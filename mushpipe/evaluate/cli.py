@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from mushpipe.core.report import RunReport
     from mushpipe.evaluate.command import Request
     from mushpipe.evaluate.judging import Rules
+    from mushpipe.evaluate.running import Override
 
 
 TargetsArgument = Annotated[
@@ -129,12 +130,14 @@ def evaluate(
             frames=frames, topic=topic, out=out, report=report,
         )  # fmt: skip
         raise typer.Exit(_planes(targets, plane, threshold or [], rules, output))
-    limit = [] if frames is None else [f"source.max_frames={frames}"]
+    overrides: list[Override] = [*(set_ or [])]
+    if frames is not None:
+        overrides.insert(0, (f"source.max_frames={frames}", f"--frames {frames}"))
     request = Request(
         targets=targets,
         truth=truth or [],
         recordings=recordings or [],
-        overrides=[*limit, *(set_ or [])],
+        overrides=overrides,
         matrix=matrix or [],
         thresholds=threshold or [],
         topic=topic,

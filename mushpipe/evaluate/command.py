@@ -27,6 +27,7 @@ from mushpipe.evaluate.metrics import METRICS, Value
 from mushpipe.evaluate.results import read_results
 from mushpipe.evaluate.running import (
     Alternative,
+    Override,
     alternatives,
     plans,
     recordings_in,
@@ -50,7 +51,7 @@ class Request:
     targets: list[Path]
     truth: list[Path]
     recordings: list[Path]
-    overrides: list[str]
+    overrides: list[Override]
     matrix: list[str]
     thresholds: list[str]
     topic: str | None

@@ -17,6 +17,8 @@ from mushpipe.core.report import RunReport
 from mushpipe.core.stage import RunInfo, Sink
 
 SINK = "evaluation"
+Override = str | tuple[str, str]
+"""A text ``a.b=value``, alone or with the option of the command line that it comes from."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,11 @@ def numbered(names: Sequence[str]) -> list[str]:
 
 
 def plan_for(
-    graph: Path, recording: Path | None, overrides: Iterable[str], out: Path, registry: Registry
+    graph: Path,
+    recording: Path | None,
+    overrides: Iterable[Override],
+    out: Path,
+    registry: Registry,
 ) -> Plan:
     """Compile a graph so that its results go to a file, and nowhere else.
 
@@ -128,7 +134,7 @@ def slug(alternative: Alternative) -> str:
 def plans(
     graph: Path,
     recordings: Sequence[Path],
-    overrides: Sequence[str],
+    overrides: Sequence[Override],
     options: Sequence[Alternative],
     out: Path,
 ) -> list[tuple[Alternative, int, Plan]]:
@@ -137,7 +143,8 @@ def plans(
     Returns:
         Per run its alternative, the number of its recording, and what to run.
     """
-    changed = [o for text in options for o in (*overrides, *text.overrides)]
+    given = [item if isinstance(item, str) else item[0] for item in overrides]
+    changed = [o for text in options for o in (*given, *text.overrides)]
     if recordings and any(text.startswith(("source.path=", "source.use=")) for text in changed):
         raise UsageError(
             "source.path and source.use cannot be changed where recordings are given: they are "
@@ -150,7 +157,8 @@ def plans(
     for option, label in zip(options, numbered([slug(each) for each in options]), strict=True):
         for number, (name, recording) in enumerate(zip(names, sources, strict=True)):
             file = out / ".".join(filter(None, [name, label, "mcap"]))
-            plan = plan_for(graph, recording, [*overrides, *option.overrides], file, registry)
+            varied = [(text, f"--matrix {text}") for text in option.overrides]
+            plan = plan_for(graph, recording, [*overrides, *varied], file, registry)
             result.append((option, number, plan))
     return result
 

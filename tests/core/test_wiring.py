@@ -27,7 +27,7 @@ from mushpipe import (
 from mushpipe.core.errors import PluginError
 from mushpipe.core.plan import Link
 from mushpipe.core.ports import Port, Ports, ports_of
-from tests.core.lab import Both, Dice, Frames, Invert, Lab, Threshold, cli
+from tests.core.lab import Both, Dice, Frames, Invert, Lab, Threshold
 
 
 def declared(process: Any) -> type[Stage]:

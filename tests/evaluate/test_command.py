@@ -477,6 +477,14 @@ def test_matrix_compares_on_the_same_frames(graph: Path, tmp_path: Path) -> None
     assert "minus detect.radius_px=[8,45], on the same 3 frames" in shown
 
 
+def test_a_fault_is_told_with_the_option_it_comes_from(graph: Path, tmp_path: Path) -> None:
+    bed = tmp_path / "bed.mcap"
+    told = str(run(graph, "--recordings", bed, "--frames", "0").exception)
+    assert told.startswith("--frames 0: max_frames of 'mcap': ")
+    told = str(run(graph, "--recordings", bed, "--matrix", "segmen.use=otsu,height").exception)
+    assert told.startswith("--matrix segmen.use=otsu: unknown path 'segmen.use'")
+
+
 def test_options_that_need_a_graph_say_so(perfect: Path) -> None:
     result = run(perfect, "--matrix", "a.b=1,2")
     assert isinstance(result.exception, UsageError)
