@@ -93,6 +93,10 @@ class GraphError(MushpipeError):
 def suggest(name: str, known: Sequence[str]) -> str:
     """Return ``did you mean 'x'?`` for the nearest known name, else the list of known names."""
     near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    if not near:  # F is the heading of a table, and OTSU how papers write it
+        lowered = {each.lower(): each for each in known}
+        found = difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.5)
+        near = [lowered[each] for each in found]
     if near:
         return f"did you mean '{near[0]}'?"
     return f"known: {', '.join(known)}" if known else "none is known here"

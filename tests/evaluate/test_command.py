@@ -79,7 +79,7 @@ def test_thresholds_set_the_exit_code(perfect: Path, threshold: str, code: int) 
     assert run(perfect, "--threshold", threshold).exit_code == code
 
 
-@pytest.mark.parametrize("name", ["axis_mean", "speed_pik_p50_ms"])
+@pytest.mark.parametrize("name", ["axis_mean", "speed_pik_p50_ms", "F"])
 def test_a_misspelt_metric_is_found(perfect: Path, name: str) -> None:
     result = run(perfect, "--threshold", f"{name}<1")
     assert isinstance(result.exception, UsageError)
