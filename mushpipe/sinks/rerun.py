@@ -116,7 +116,8 @@ class RerunSink(Sink):
             self._held = opened_alone(self._path) if self._path else None  # set_sinks empties it
             self._recording.set_sinks(*sinks)
         except (OSError, RuntimeError) as error:
-            raise UsageError(f"save: {self.save} cannot be written: {error}") from error
+            reason = getattr(error, "strerror", None) or error  # without errno and PosixPath(...)
+            raise UsageError(f"save: {self.save} cannot be written: {reason}") from error
         self._memories = (Remembering(self._recording), Remembering(self._recording))
         graph, file = run.manifest.get("graph", {}), Path(run.manifest.get("graph_file", ""))
         self._recording.send_recording_name(f"{run.recording} {file.stem}".strip())

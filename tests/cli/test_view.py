@@ -111,3 +111,7 @@ def test_a_file_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["view", str(recording), "--save", "/dev/full"])
     assert isinstance(result.exception, UsageError)
     assert "/dev/full cannot be written" in str(result.exception)
+    folder = tmp_path / "out"
+    folder.mkdir()
+    result = CliRunner().invoke(app, ["view", str(recording), "--save", str(folder)])
+    assert str(result.exception) == f"save: {folder} cannot be written: Is a directory"
