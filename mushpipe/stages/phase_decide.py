@@ -35,7 +35,6 @@ _LEARNED = NAMES.index(LEARNED)
 MARGIN = 1.0  # px; so far within an accepted circle an outline counts as hidden by it
 HOPELESS = 2e-5  # probability from which on nothing that is accepted later can help
 LIKELY = 0.5  # probability from which on a circle is more likely a cap than not
-AGREED = 3.0  # of `learned` in the order of those that are likely, of a probability 1
 TAKEN = 2.5  # px; edges so near an accepted outline are its own
 
 
@@ -132,7 +131,7 @@ def _use_up(edges: Strips, shape: Shape, number: int, owner: Rows, scratch: Scra
 @jit
 def decide(
     edges: Strips, shapes: Table, hits: Rows, table: Table, which: Rows, models: Models,
-    least: float,
+    least: float, agreed: float,
 ) -> tuple[Rows, Table, Rows]:  # fmt: skip
     """Accept candidates in the order of their probability, and of a network's agreement.
 
@@ -145,6 +144,7 @@ def decide(
         which: (N,) the model that decides on a candidate.
         models: The models.
         least: Smallest probability that is accepted.
+        agreed: How much `learned` counts in the order of the likely ones, of a probability 1.
 
     Returns:
         Rows of the accepted in their order, the probability of every candidate, and of every edge
@@ -166,7 +166,7 @@ def decide(
             if waiting[k] and chance[k] >= least:
                 rank = chance[k]
                 if chance[k] >= LIKELY:
-                    rank += AGREED * table[k, _LEARNED]
+                    rank += agreed * table[k, _LEARNED]
                 if rank >= top:
                     best, top = k, rank
         if best < 0:

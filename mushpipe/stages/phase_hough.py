@@ -53,6 +53,7 @@ _STANDING = 0.004  # m; what is higher than this over the bed is looked at, in t
 EVIDENCE = 0.07  # share of an outline that votes; half-hidden caps show hardly more
 _BESIDE = 0.2  # the same beside a network: what has less it sees as well, and fewer cost less time
 _EVERY = 2  # edge points; of so many one votes where network and depth bring candidates as well
+_AGREED = 3.0  # of `learned`, in the order in which likely circles are accepted
 _SEEN = 0.1  # of `learned`; without depth, what the network sees less of is no cap
 _SURE = 0.8  # of a network's circle, from which on it is taken for a cap though it has no outline
 _LARGE = 80.0  # px; radius up to which caps are looked for in any case where [8, null] is set
@@ -224,14 +225,16 @@ class PhaseHough(Stage):
         parts = (shapes[kept], hits[kept], table[kept], middle[kept])
         return Evidence(edges, *parts, high, pixel, limits, known)
 
-    def decide(self, found: Evidence) -> tuple[Rows, Table, Rows]:
-        """Return the accepted rows in their order, all probabilities, and whose each edge is."""
+    def decide(self, found: Evidence, agreed: float = _AGREED) -> tuple[Rows, Table, Rows]:
+        """Return the accepted rows in their order, all probabilities, and whose each edge is.
+
+        `agreed` is how much the network counts in the order of the likely ones.
+        """
         # Where no circle of the other detector lies, it has nothing to say.
         asked = found.table[:, NAMES.index(LEARNED)] > 0
         which = (np.isfinite(found.middle) + 2 * asked).astype(np.int32)
-        return decide(
-            found.edges, found.shapes, found.hits, found.table, which, self._load(), self.min_score
-        )
+        parts = (found.edges, found.shapes, found.hits, found.table)
+        return decide(*parts, which, self._load(), self.min_score, agreed)
 
     def _load(self) -> Models:
         """Return the models, read once."""
