@@ -165,14 +165,14 @@ def samples(stage: PhaseHough, cases: Iterable[Prepared], deep: bool) -> tuple[F
     """Return features (N, F) and labels (N,) of the candidates with depth, or of those without.
 
     They are accepted by their probability alone: models that learnt from the order that the network
-    leads let more false circles pass on the frames for choosing (55 and 47).
+    leads with depth let more false circles pass on the frames for choosing.
     """
     rows, right = [np.zeros((0, len(NAMES)))], [np.zeros(0)]
     for case, frame, mask, learned, _ in cases:
         found = stage.gather(replace(frame), mask, learned)  # what a frame caches takes room
         if found is None or not len(found.shapes):
             continue
-        order, chance, _ = stage.decide(found, agreed=0.0)
+        order, chance, _ = stage.decide(found)
         circles = Circles(found.shapes[:, :2], equal_area_radius(found.shapes), chance)
         label = labels(case, circles, order)
         use = np.isfinite(label) & (np.isfinite(found.middle) == deep)
