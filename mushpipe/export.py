@@ -48,7 +48,10 @@ def read_picks(path: Path, topic: str | None = None) -> Iterator[tuple[Header, P
             f"{path}: several topics hold picks: choose with --topic {' or --topic '.join(topics)}"
         )
     if not topics:
-        raise InputError(f"{path}: no picks on any topic ({reader.contents()})")
+        raise InputError(
+            f"{path}: no picks on any topic ({reader.contents()}); a stage 'picks' makes them, "
+            "behind one that locates, such as cap-fit"
+        )
     if topic not in (None, *topics):
         raise UsageError(f"{path}: no picks on {topic}; they are on {', '.join(topics)}")
     for raw in reader.messages({topic or topics[0]}):
