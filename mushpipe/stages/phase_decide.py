@@ -1,10 +1,10 @@
 """Accepting candidates one by one: each explains its edges away for those that come after it.
 
 The candidate with the largest probability is accepted, and its edges are used up; of those that are
-likely the one that a network agrees with most comes first, where there is one: what depth does not
-see, or sees twice, makes a rival of the same probability that lies beside the cap. Its neighbours
-are then looked at again: another circle on the same cap has lost its support, while one below it
-need no longer show the outline that it hides. This is the non-maximum suppression of the detector.
+likely, those that a network agrees with come first where it leads, for holes and errors of depth
+make rivals as probable that lie beside the cap. Its neighbours are then looked at again: another
+circle on the same cap has lost its support, while one below it need no longer show the outline that
+it hides. This is the non-maximum suppression of the detector.
 """
 
 from __future__ import annotations
@@ -131,9 +131,9 @@ def _use_up(edges: Strips, shape: Shape, number: int, owner: Rows, scratch: Scra
 @jit
 def decide(
     edges: Strips, shapes: Table, hits: Rows, table: Table, which: Rows, models: Models,
-    least: float, agreed: float,
+    least: float, led: bool,
 ) -> tuple[Rows, Table, Rows]:  # fmt: skip
-    """Accept candidates in the order of their probability, and of a network's agreement.
+    """Accept candidates in the order of their probability.
 
     Args:
         edges: Edge points.
@@ -144,7 +144,7 @@ def decide(
         which: (N,) the model that decides on a candidate.
         models: The models.
         least: Smallest probability that is accepted.
-        agreed: How much `learned` counts in the order of the likely ones, of a probability 1.
+        led: Whether those that are likely come in the order of probability plus `learned`.
 
     Returns:
         Rows of the accepted in their order, the probability of every candidate, and of every edge
@@ -165,8 +165,8 @@ def decide(
         for k in range(n):
             if waiting[k] and chance[k] >= least:
                 rank = chance[k]
-                if chance[k] >= LIKELY:
-                    rank += agreed * table[k, _LEARNED]
+                if led and chance[k] >= LIKELY:
+                    rank += table[k, _LEARNED]
                 if rank >= top:
                     best, top = k, rank
         if best < 0:

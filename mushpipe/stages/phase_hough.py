@@ -53,7 +53,6 @@ _STANDING = 0.004  # m; what is higher than this over the bed is looked at, in t
 EVIDENCE = 0.07  # share of an outline that votes; half-hidden caps show hardly more
 _BESIDE = 0.2  # the same beside a network: what has less it sees as well, and fewer cost less time
 _EVERY = 2  # edge points; of so many one votes where network and depth bring candidates as well
-_AGREED = 3.0  # of `learned`, in the order of likely circles, with depth; images place them better
 _SEEN = 0.1  # of `learned`; without depth, what the network sees less of is no cap
 _SURE = 0.8  # of a network's circle, from which on it is taken for a cap though it has no outline
 _LARGE = 80.0  # px; radius up to which caps are looked for in any case where [8, null] is set
@@ -165,7 +164,8 @@ class PhaseHough(Stage):
         found = self.gather(frame, mask, learned if self.use_learned else None)
         if found is None:
             return Circles(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
-        order, chance, owner = self.decide(found, _AGREED if len(found.height) else 0.0)
+        # Beside depth: an image alone places circles better than the network does.
+        order, chance, owner = self.decide(found, led=len(found.height) > 0)
         shapes, score = found.shapes[order], chance[order]
         # What is hardly a cap changes nothing about those that are likely: it takes no edges from
         # them, and what is a cap only beside it is no more likely than it is.
@@ -225,16 +225,16 @@ class PhaseHough(Stage):
         parts = (shapes[kept], hits[kept], table[kept], middle[kept])
         return Evidence(edges, *parts, high, pixel, limits, known)
 
-    def decide(self, found: Evidence, agreed: float = 0.0) -> tuple[Rows, Table, Rows]:
+    def decide(self, found: Evidence, led: bool = False) -> tuple[Rows, Table, Rows]:
         """Return the accepted rows in their order, all probabilities, and whose each edge is.
 
-        `agreed` is how much the network counts in the order of the likely ones.
+        `led` is whether the network has a say in the order of the likely ones.
         """
         # Where no circle of the other detector lies, it has nothing to say.
         asked = found.table[:, NAMES.index(LEARNED)] > 0
         which = (np.isfinite(found.middle) + 2 * asked).astype(np.int32)
         parts = (found.edges, found.shapes, found.hits, found.table)
-        return decide(*parts, which, self._load(), self.min_score, agreed)
+        return decide(*parts, which, self._load(), self.min_score, led)
 
     def _load(self) -> Models:
         """Return the models, read once."""

@@ -274,6 +274,7 @@ def test_of_likely_rivals_the_one_that_a_network_agrees_with_comes_first(likely:
     logit = np.float32(0.4 if likely else -0.4)
     alike = alike._replace(scale=alike.scale + 1, b3=alike.b3 + logit)
     which = np.zeros(n, np.int32)
-    order, _, _ = decide(found.edges, found.shapes, found.hits, found.table, which, alike, 0.3, 1.0)
+    parts = (found.edges, found.shapes, found.hits, found.table)
+    order, _, _ = decide(*parts, which, alike, least=0.3, led=True)
     first_agreed, last_given = list(range(n)), list(range(n))[::-1]
     assert order.tolist() == (first_agreed if likely else last_given)
