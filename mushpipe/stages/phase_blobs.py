@@ -36,7 +36,22 @@ def blobs_of(relief: Relief, smallest: float, largest: float) -> Plane:
         away = cv2.distanceTransform(standing, cv2.DIST_L2, cv2.DIST_MASK_5)
         limits = (0.9 * smallest / pixel, 1.1 * largest / pixel)
         found.append(_discs(np.asarray(away, np.float32), pixel, limits))
-    return np.concatenate(found)
+    return _distinct(np.concatenate(found))
+
+
+@jit
+def _distinct(discs: Plane) -> Plane:
+    """Return discs (N, 4) but for those that are the same, to half a step, as one before."""
+    kept = 0
+    for k in range(len(discs)):
+        new = True
+        for other in discs[:kept]:
+            away = max(abs(other[0] - discs[k, 0]), abs(other[1] - discs[k, 1]))
+            new &= max(away, abs(other[2] - discs[k, 2])) > CELL
+        if new:
+            discs[kept] = discs[k]
+            kept += 1
+    return discs[:kept]
 
 
 @jit
