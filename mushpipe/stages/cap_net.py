@@ -26,7 +26,7 @@ from mushpipe.stages.cap_decode import (
     circles_of,
     first_of_each,
 )
-from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE, discs_of
+from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE, certain_first, discs_of
 from mushpipe.stages.letterbox import resized
 
 FILE = "cap_net.onnx"
@@ -132,8 +132,7 @@ class CapNet(Stage):
         """Return the circles of two scales; of a fine one within a surer coarse one nothing."""
         away = np.linalg.norm(fine.center[:, None] - coarse.center, axis=2)
         within = (away < coarse.radius) & (fine.score[:, None] <= coarse.score)
-        every = coarse.joined(fine.take(~within.any(axis=1)))
-        every = every.take(np.argsort(-every.score, kind="stable"))
+        every = certain_first(coarse.joined(fine.take(~within.any(axis=1))))
         return every.take(first_of_each(discs_of(every), self.overlap))
 
     def _look(self, color: NDArray[np.uint8], scale: float, largest: float) -> tuple[Mask, Circles]:

@@ -20,6 +20,11 @@ def discs_of(circles: Circles) -> NDArray[np.float64]:
     return np.column_stack([circles.center, circles.radius])
 
 
+def certain_first(circles: Circles) -> Circles:
+    """Return the circles in the order of their scores."""
+    return circles.take(np.argsort(-circles.score, kind="stable"))
+
+
 def radii_on_rays(circles: Circles, camera: Camera) -> NDArray[np.float64]:
     """Return the radii (N,) of circles on the plane z = 1, NaN where the lens has no rays.
 

@@ -12,6 +12,7 @@ from pydantic import Field, PrivateAttr, model_validator
 
 from mushpipe import Circles, Mask, RgbdFrame, Stage, UsageError
 from mushpipe.core.paths import GraphPath
+from mushpipe.stages.discs import certain_first
 from mushpipe.stages.doubling import doubled
 from mushpipe.stages.phase_blobs import blobs_of
 from mushpipe.stages.phase_decide import LIKELY, decide
@@ -30,7 +31,6 @@ from mushpipe.stages.phase_learned import (
     add_discs,
     agreement,
     candidates_of,
-    certain_first,
     largest_of,
     with_bare,
     within,

@@ -11,7 +11,7 @@ from mushpipe import Circles
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.cap_clod import off_ground
 from mushpipe.stages.cap_kin import tones_of
-from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE, iou, lens
+from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE, certain_first, iou, lens
 from mushpipe.stages.phase_edges import Plane, Rows
 from mushpipe.stages.phase_refit import Table
 
@@ -74,11 +74,6 @@ def without_clods(color: NDArray[np.uint8], circles: Circles, unseen: NDArray[np
         return circles
     away = off_ground(color, circles, tones_of(color, circles), asked, _UNEVEN)
     return circles.take(~(away < _GROUND))
-
-
-def certain_first(circles: Circles) -> Circles:
-    """Return the circles in the order of their scores."""
-    return circles.take(np.argsort(-circles.score, kind="stable"))
 
 
 def with_bare(
