@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.discs import lens
 from mushpipe.stages.phase_edges import Rows, Shape, Singles
-from mushpipe.stages.phase_features import LEARNED, NAMES
+from mushpipe.stages.phase_features import AT_LEARNED
 from mushpipe.stages.phase_refit import (
     COSINES,
     HIDDEN,
@@ -31,7 +31,6 @@ from mushpipe.stages.phase_scratch import Scratch, scratch_for
 from mushpipe.stages.phase_strips import Strips
 from mushpipe.stages.verifier_net import Models, probability
 
-_LEARNED = NAMES.index(LEARNED)
 MARGIN = 1.0  # px; so far within an accepted circle an outline counts as hidden by it
 HOPELESS = 2e-5  # probability from which on nothing that is accepted later can help
 LIKELY = 0.5  # probability from which on a circle is more likely a cap than not
@@ -166,7 +165,7 @@ def decide(
             if waiting[k] and chance[k] >= least:
                 rank = chance[k]
                 if led and chance[k] >= LIKELY:
-                    rank += table[k, _LEARNED]
+                    rank += table[k, AT_LEARNED]
                 if rank >= top:
                     best, top = k, rank
         if best < 0:

@@ -49,6 +49,7 @@ DEPTH_FEATURES = {
 }
 LEARNED = "learned"  # what circles of another detector say; see `phase_learned`
 NAMES = (*IMAGE_FEATURES, *DEPTH_FEATURES, LEARNED)
+AT_LEARNED = NAMES.index(LEARNED)
 FIRST_STATIC = list(NAMES).index("residual")
 FIRST_DEPTH = len(IMAGE_FEATURES)
 SAMPLES = 16  # directions in which the disc is sampled

@@ -25,7 +25,7 @@ from mushpipe.stages.phase_edges import (
     gradient_of,
     otsu_of,
 )
-from mushpipe.stages.phase_features import LEARNED, NAMES, static_features
+from mushpipe.stages.phase_features import AT_LEARNED, static_features
 from mushpipe.stages.phase_fuse import fused
 from mushpipe.stages.phase_learned import (
     add_discs,
@@ -177,7 +177,7 @@ class PhaseHough(Stage):
         if found.learned is None:
             return circles
         if len(found.height):
-            unseen = found.table[order, NAMES.index(LEARNED)] == 0
+            unseen = found.table[order, AT_LEARNED] == 0
             return certain_first(without_clods(frame.color, circles, unseen))
         sure = found.learned.take(found.learned.score >= max(_SURE, self.min_score))
         radius = equal_area_radius(found.shapes)
@@ -217,10 +217,10 @@ class PhaseHough(Stage):
             image, gradient, inside, high, pixel, shapes, hits, residual
         )
         if learned is not None:
-            table[:, NAMES.index(LEARNED)] = agreement(shapes, equal_area_radius(shapes), learned)
+            table[:, AT_LEARNED] = agreement(shapes, equal_area_radius(shapes), learned)
         kept = self._plausible(shapes, middle, relief)
         if learned is not None:
-            kept &= np.isfinite(middle) | (table[:, NAMES.index(LEARNED)] >= _SEEN)
+            kept &= np.isfinite(middle) | (table[:, AT_LEARNED] >= _SEEN)
         limits = (smallest, largest)
         parts = (shapes[kept], hits[kept], table[kept], middle[kept])
         return Evidence(edges, *parts, high, pixel, limits, known)
@@ -231,7 +231,7 @@ class PhaseHough(Stage):
         `led` is whether the network has a say in the order of the likely ones.
         """
         # Where no circle of the other detector lies, it has nothing to say.
-        asked = found.table[:, NAMES.index(LEARNED)] > 0
+        asked = found.table[:, AT_LEARNED] > 0
         which = (np.isfinite(found.middle) + 2 * asked).astype(np.int32)
         parts = (found.edges, found.shapes, found.hits, found.table)
         return decide(*parts, which, self._load(), self.min_score, led)
