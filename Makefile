@@ -106,6 +106,20 @@ soak: $(STAMP)
 recordings: $(STAMP) system-libraries
 	$(BIN)/python -m mushpipe.sim.recordings
 
+# Beds by another renderer, with their truth, and the graphs held against them: no scene or shape of the
+# simulator, nothing chosen on them. A quarter of an hour on two cores.
+TRACED := out/traced
+.PHONY: traced
+traced: $(STAMP) system-libraries
+	@ldconfig -p | grep -q libLLVM.so.19 || { \
+	  if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+	    apt-get update -qq && apt-get install -y -qq libllvm19 >/dev/null; \
+	  else echo "note: Mitsuba needs LLVM 15 or newer: sudo apt-get install libllvm19"; fi; }
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[traced]'
+	$(BIN)/python -m training.traced --out $(TRACED)/beds.mcap
+	for graph in pick classic colour; do \
+	  $(BIN)/mushpipe eval graphs/$$graph.yaml --recordings $(TRACED); done
+
 # Results every recording is held to; shows what changes.
 .PHONY: goldens
 goldens: $(STAMP)-dev system-libraries

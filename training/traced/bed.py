@@ -106,7 +106,7 @@ def _grown(k: int, places: Floats, radii: Floats, color: str, rng: np.random.Gen
     way = places[k] - places
     near = np.linalg.norm(way, axis=1) < 1.6 * (radii + radii[k])
     push = (way[near] / radii[k]).sum(axis=0)
-    lean = 0.16 * push + rng.normal(0, 0.14, 2)
+    lean = 0.10 * push + rng.normal(0, 0.10, 2)
     lean *= min(1, 0.8 / max(float(np.linalg.norm(lean)), 1e-9))
     axis = np.array([*lean, 1]) / np.sqrt(1 + lean @ lean)
     radius = radii[k]
