@@ -15,19 +15,13 @@ from pydantic import Field, PrivateAttr, field_validator
 from mushpipe import Circles, DepthSource, Locations, PickFlag, Picks, Poses, RgbdFrame, Stage
 from mushpipe.core.errors import UsageError
 from mushpipe.core.transform import Transform, TransformSetting
+from mushpipe.stages.plausible import require_plausible
 from mushpipe.stages.surroundings import clearance, hidden_share
 from mushpipe.stages.tracks import Tracks
 
 logger = logging.getLogger("mushpipe")
 SMALLEST_MM = 1.0
 HEIGHT = 0.3  # of a usual cap, in diameters
-_ONE_CHAIN = (
-    "circles, locations and poses must come from one chain; what sorts or filters circles belongs "
-    "before the localizer"
-)
-# Radii from the middle of its circle: a location is seen there, the apex of a leaning cap up to two
-# away. Neighbours are apart by two where they touch.
-ASTRAY = {"location": 1.0, "pose": 3.0}
 Rank = Literal["unoccluded", "highest", "largest", "score"]
 FlagName = Literal[
     "depth_missing",
@@ -109,16 +103,13 @@ class MakePicks(Stage):
         """Return the picks, the first to pick first, in the robot's frame or the camera's.
 
         Raises:
-            ValueError: The inputs differ in their number of rows, or are of different circles.
+            ValueError: The inputs differ in their number of rows, are of different circles, or
+                cannot be as a camera sees them.
             UsageError: `T_base_camera` names the camera's frame for the robot's.
         """
         n = len(circles)
         poses = Poses.unknown(n) if poses is None else poses
-        if not n == len(locations) == len(poses):
-            counts = f"{n} circles, {len(locations)} locations, {len(poses)} poses"
-            raise ValueError(f"{counts}: {_ONE_CHAIN}")
-        _require_same(circles, locations.position, "location", frame)
-        _require_same(circles, poses.apex, "pose", frame)
+        require_plausible(circles, locations, poses, frame.camera)
         self._total += n
         self._missing += int((locations.source == DepthSource.MISSING).sum())
         height, width = frame.color.shape[:2]
@@ -214,26 +205,6 @@ class MakePicks(Stage):
                 self._missing,
                 self._total,
             )
-
-
-def _require_same(
-    circles: Circles,
-    points: NDArray[np.float64],
-    what: Literal["location", "pose"],
-    frame: RgbdFrame,
-) -> None:
-    """Raise ValueError where a point (N, 3) is not seen in its circle: rows were mixed up."""
-    if frame.camera is None:
-        return
-    seen = frame.camera.project(points)
-    away = np.linalg.norm(seen - circles.center, axis=1) > ASTRAY[what] * circles.radius
-    if away.any():
-        row = int(np.flatnonzero(away)[0])
-        (u, v), (x, y) = circles.center[row], seen[row]
-        raise ValueError(
-            f"row {row}: the circle is at ({u:.0f}, {v:.0f}), its {what} at ({x:.0f}, {y:.0f}): "
-            f"{_ONE_CHAIN}"
-        )
 
 
 def _sigma_position(picks: Picks) -> NDArray[np.float64]:

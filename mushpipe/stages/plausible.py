@@ -1,0 +1,78 @@
+"""Whether locations and poses can be those of their circles: no other may reach a robot."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mushpipe import Circles, Locations, Poses
+from mushpipe.core.geometry import Camera, lengths
+
+_ONE_CHAIN = (
+    "circles, locations and poses must come from one chain; what sorts or filters circles belongs "
+    "before the localizer"
+)
+_METRES = "are all lengths in metres, and all of this circle?"
+# Radii from the middle of its circle: a location is seen there, the apex of a leaning cap up to two
+# away. Neighbours are apart by two where they touch.
+ASTRAY = {"location": 1.0, "pose": 3.0}
+# No unit is mistaken for another by less. What is found differs by a factor of three at most.
+UNIT = 10.0
+
+
+def require_plausible(
+    circles: Circles, locations: Locations, poses: Poses, camera: Camera | None
+) -> None:
+    """Raise ValueError where rows were mixed up, or lengths are none of what a camera sees."""
+    if not len(circles) == len(locations) == len(poses):
+        counts = f"{len(circles)} circles, {len(locations)} locations, {len(poses)} poses"
+        raise ValueError(f"{counts}: {_ONE_CHAIN}")
+    for what, points in (("location", locations.position), ("pose", poses.apex)):
+        _require_in_front(points, what)
+        if camera is not None:
+            _require_same(circles, camera.project(points), what)
+    if camera is not None:
+        _require_size(circles, locations, poses, camera)
+
+
+def _require_in_front(points: NDArray[np.float64], what: str) -> None:
+    """Raise ValueError where a point (N, 3) is not before the camera."""
+    if (row := _first(points[:, 2] <= 0)) is not None:
+        x, y, z = points[row]
+        raise ValueError(
+            f"row {row}: its {what} is at ({x:g}, {y:g}, {z:g}), which is not in front of the "
+            "camera; where depth is missing, a location is NaN and its source MISSING"
+        )
+
+
+def _require_same(circles: Circles, seen: NDArray[np.float64], what: str) -> None:
+    """Raise ValueError where a point, seen at (N, 2) px, is not seen in its circle."""
+    away = np.linalg.norm(seen - circles.center, axis=1) > ASTRAY[what] * circles.radius
+    if (row := _first(away)) is not None:
+        (u, v), (x, y) = circles.center[row], seen[row]
+        raise ValueError(
+            f"row {row}: the circle is at ({u:.0f}, {v:.0f}), its {what} at ({x:.0f}, {y:.0f}): "
+            f"{_ONE_CHAIN}"
+        )
+
+
+def _require_size(circles: Circles, locations: Locations, poses: Poses, camera: Camera) -> None:
+    """Raise ValueError where a diameter, or the way to an apex, is far from the circle's size."""
+    across = 2 * circles.radius * locations.position[:, 2] / np.sqrt(camera.fx * camera.fy)
+    ratio = locations.diameter / across
+    if (row := _first((ratio > UNIT) | (ratio < 1 / UNIT))) is not None:
+        raise ValueError(
+            f"row {row}: its diameter is {locations.diameter[row]:.3g} m, but its circle is "
+            f"{across[row]:.3g} m wide at its location: {_METRES}"
+        )
+    way = lengths(poses.apex - locations.position)
+    if (row := _first(way > UNIT * across)) is not None:
+        raise ValueError(
+            f"row {row}: the apex of its pose is {way[row]:.3g} m from its location, but its "
+            f"circle is {across[row]:.3g} m wide there: {_METRES}"
+        )
+
+
+def _first(wrong: NDArray[np.bool_]) -> int | None:
+    """Return the first row (N,) that is wrong."""
+    return int(np.argmax(wrong)) if wrong.any() else None

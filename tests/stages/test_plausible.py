@@ -1,0 +1,67 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mushpipe import Circles, DepthSource, Locations, Poses, quaternion_from_axis
+from mushpipe.stages.picks import MakePicks
+from tests.stages.scenes import CAMERA, frame_of
+
+FRAME = frame_of(np.zeros((120, 160)))
+CIRCLES = Circles([(50, 50), (80, 60)], [8, 8], [1, 1])
+POSITION = CAMERA.deproject(CIRCLES.center, np.full(2, 0.5))
+LOCATIONS = Locations.unknown(
+    2,
+    position=POSITION,
+    distance=np.linalg.norm(POSITION, axis=1),
+    diameter=8 / CAMERA.fx * np.ones(2),
+    source=np.full(2, DepthSource.MEASURED),
+)
+
+
+def poses(apex: np.ndarray) -> Poses:
+    axis = np.tile((0.0, 0.0, -1.0), (2, 1))
+    return Poses(quaternion_from_axis(axis), axis, apex, np.ones(2), np.ones(2), np.ones(2, bool))
+
+
+@pytest.mark.parametrize(
+    ("position", "diameter", "message"),
+    [
+        (POSITION * 0, 1, r"row 0: its location is at .*0, 0\), which is not in front"),
+        (-POSITION, 1, r"its location is at .*, which is not in front of the camera"),
+        (POSITION, 1000, "row 0: its diameter is .* m, but its circle is .* m wide"),
+        (POSITION * 1000, 1, "row 0: its diameter is .* in metres"),
+        (POSITION * 100, 1, "row 0: its diameter is .* in metres"),
+    ],
+)
+def test_a_location_that_no_camera_sees_is_refused(
+    position: np.ndarray, diameter: float, message: str
+) -> None:
+    wrong = replace(LOCATIONS, position=position, diameter=LOCATIONS.diameter * diameter)
+    with pytest.raises(ValueError, match=message):
+        MakePicks().process(FRAME, CIRCLES, wrong)
+
+
+@pytest.mark.parametrize(
+    ("apex", "message"),
+    [
+        (POSITION * 0, "row 0: its pose is at .* not in front"),
+        (POSITION * 1000, "row 0: the apex of its pose is .* m from its location"),
+    ],
+)
+def test_an_apex_far_from_its_cap_is_refused(apex: np.ndarray, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        MakePicks().process(FRAME, CIRCLES, LOCATIONS, poses(apex))
+
+
+def test_without_a_calibration_a_location_is_in_front_of_the_camera_all_the_same() -> None:
+    blind = replace(FRAME, camera=None)
+    with pytest.raises(ValueError, match="not in front"):
+        MakePicks().process(blind, CIRCLES, replace(LOCATIONS, position=POSITION * 0))
+
+
+def test_what_a_camera_sees_is_taken_and_so_is_what_is_unknown() -> None:
+    assert len(MakePicks().process(FRAME, CIRCLES, LOCATIONS, poses(POSITION))) == 2
+    assert len(MakePicks().process(FRAME, CIRCLES, Locations.unknown(2))) == 2
