@@ -28,7 +28,7 @@ _FLAGS = tuple((int(flag), flag.name.lower()) for flag in PickFlag if flag.name)
 _SOURCES = {int(source): source.name.lower() for source in DepthSource}
 UNIT_TOLERANCE = 1e-3
 # Beyond these a number is not a measurement.
-FARTHEST_M, SMALLEST_M = 100.0, 0.0001
+FARTHEST_M, SMALLEST_M, LARGEST_M = 100.0, 0.0001, 1.0
 ID_LIMIT = 10**15  # an acknowledgement has no place for more digits
 
 
@@ -136,7 +136,7 @@ def _valid(picks: Picks, oriented: Bools) -> Bools:
     good &= (np.abs(picks.position) <= FARTHEST_M).all(axis=1)
     good &= (picks.score >= 0) & (picks.score <= 1)
     good &= (picks.id >= 0) & (picks.id < ID_LIMIT)
-    sized = (picks.diameter >= SMALLEST_M) & (picks.diameter <= FARTHEST_M)
+    sized = (picks.diameter >= SMALLEST_M) & (picks.diameter <= LARGEST_M)
     good &= sized | np.isnan(picks.diameter)
     for direction in (picks.quaternion, picks.axis):
         unit = np.abs(np.linalg.norm(direction, axis=1) - 1) <= UNIT_TOLERANCE

@@ -114,6 +114,7 @@ def test_an_orientation_that_is_missing_without_a_flag_is_flagged() -> None:
         {"score": [1.5, 0.5]},
         {"diameter": [INF, 0.04]},
         {"diameter": [-0.04, 0.04]},
+        {"diameter": [4, 0.04]},  # in cm
         {"quaternion": [[2, 0, 0, 0], [1, 0, 0, 0]]},
         {"axis": [[0, 0, -3], [0, 0, -1]]},
         {"axis": [[0, 0, 1], [0, 0, -1]]},  # not where the quaternion turns +z to
