@@ -49,6 +49,11 @@ class Transform(Group):
             raise ValueError("the quaternion must have length 1")
         return value
 
+    @property
+    def rise(self) -> float:
+        """How much the source frame's z axis rises along that of the target frame, -1 to 1."""
+        return float(self._matrix()[2, 2])
+
     def points(self, points: Floats) -> Floats:
         """Transform (N, 3) points, m; rows of NaN stay NaN."""
         return np.asarray(self.directions(points) + self.translation)

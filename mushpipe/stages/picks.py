@@ -21,6 +21,7 @@ from mushpipe.stages.tracks import Tracks
 
 logger = logging.getLogger("mushpipe")
 SMALLEST_MM = 1.0
+LEVEL = 0.2  # of a camera that looks level, the rise along its axis
 HEIGHT = 0.3  # of a usual cap, in diameters
 Rank = Literal["unoccluded", "highest", "largest", "score"]
 FlagName = Literal[
@@ -88,9 +89,17 @@ class MakePicks(Stage):
     _total: int = PrivateAttr(0)
     _missing: int = PrivateAttr(0)
     _left_out: int = PrivateAttr(0)
+    _inward: bool = PrivateAttr(False)
 
     def open(self) -> None:
-        """Compile the kernels."""
+        """Compile the kernels, and say where a camera above the bed would look up."""
+        if self.T_base_camera is not None and self.T_base_camera.rise > LEVEL:
+            logger.warning(
+                "by T_base_camera the camera looks up along z of '%s': is the quaternion x y z w, "
+                "and the pose that of the camera in the robot's frame? What counts as highest goes "
+                "by that z",
+                self.T_base_camera.frame,
+            )
         hidden_share(Circles(np.full((1, 2), 4.0), np.ones(1), np.ones(1)), np.ones(1), (8, 8))
 
     def process(
@@ -110,6 +119,7 @@ class MakePicks(Stage):
         n = len(circles)
         poses = Poses.unknown(n) if poses is None else poses
         require_plausible(circles, locations, poses, frame.camera)
+        self._warn_of_inward(locations, poses, frame.header.sequence)
         self._total += n
         self._missing += int((locations.source == DepthSource.MISSING).sum())
         height, width = frame.color.shape[:2]
@@ -136,6 +146,19 @@ class MakePicks(Stage):
         chosen = self._chosen(picks, up, hidden)
         self._left_out += n - len(chosen)
         return picks.take(chosen)
+
+    def _warn_of_inward(self, locations: Locations, poses: Poses, sequence: int) -> None:
+        """Say once where a robot would be told to come from below."""
+        away = np.einsum("ij,ij->i", poses.axis, locations.position) > 0
+        if away.any() and not self._inward:
+            self._inward = True
+            logger.warning(
+                "frame %d: %d of %d axes point away from the camera, which sees the caps: an axis "
+                "points out of its cap, and a robot comes from there",
+                sequence,
+                away.sum(),
+                poses.valid.sum(),
+            )
 
     def _flags(
         self,

@@ -9,7 +9,15 @@ import pytest
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from mushpipe import Circles, DepthSource, Locations, PickFlag, Picks, Poses
+from mushpipe import (
+    Circles,
+    DepthSource,
+    Locations,
+    PickFlag,
+    Picks,
+    Poses,
+    quaternion_from_axis,
+)
 from mushpipe.core.errors import UsageError
 from mushpipe.stages.picks import MakePicks
 from mushpipe.stages.surroundings import hidden_share
@@ -224,6 +232,30 @@ def test_what_is_not_wanted_is_left_out() -> None:
     assert picked(BED, withhold=twice).id.tolist() == [1, 2]
     with pytest.raises(ValidationError, match="smallest and the largest"):
         picked(BED, diameter_mm=(60, 35))
+
+
+@pytest.mark.parametrize(
+    ("quaternion", "told"),
+    [((1, 0, 0, 0), False), ((0, 0, 0, 1), True), ((0.7071, 0, 0, 0.7071), False)],
+)
+def test_a_camera_that_looks_up_is_told_of(
+    quaternion: tuple[float, ...], told: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    pose = {"frame": "robot_base", "translation": (0, 0, 1), "quaternion": quaternion}
+    with caplog.at_level(logging.WARNING, "mushpipe"):
+        MakePicks(T_base_camera=pose).open()
+    assert ("the camera looks up along z of 'robot_base'" in caplog.text) is told
+
+
+def test_axes_into_the_bed_are_told_of_once(caplog: pytest.LogCaptureFixture) -> None:
+    stage, found = MakePicks(), locations(DepthSource.MEASURED)
+    axis = np.array([[0.0, 0.6, 0.8]])
+    one = np.ones(1)
+    poses = Poses(quaternion_from_axis(axis), axis, found.position, one, one, one > 0)
+    with caplog.at_level(logging.WARNING, "mushpipe"):
+        for _ in range(2):
+            stage.process(frame_of(np.zeros((120, 160))), circles_at((50, 50)), found, poses)
+    assert caplog.text.count("1 of 1 axes point away from the camera") == 1
 
 
 def test_the_end_of_a_run_says_how_many_were_left_out(caplog: pytest.LogCaptureFixture) -> None:
