@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mushpipe.core.geometry import axis_from_quaternion
 
 AXIS_TOLERANCE = 1e-3
+_EXACTLY = "must be finite exactly where its source is not MISSING"
 Floats = NDArray[np.float64]
 
 
@@ -26,6 +27,8 @@ def locked(array: Any, dtype: Any) -> NDArray[Any]:
     What it is a view of becomes read-only too, or it could still change. Memory that is not numpy's
     (a camera's buffer, a bytearray) cannot be locked: what can be written there is copied.
     """
+    if np.ma.is_masked(array):  # NumPy would take what is behind the mask
+        raise ValueError("it is a masked array; unknown is NaN: array.filled(np.nan)")
     result: NDArray[Any] = np.asarray(array, dtype, order="C")
     owner = result
     while isinstance(owner.base, np.ndarray):
@@ -55,15 +58,17 @@ class Columns:
     """Base of the per-mushroom types: every field made by `column` has the same length N.
 
     Raises:
-        ValueError: A field has the wrong shape, lengths differ, a column of integers is given
-            fractions or NaN, or `check` objects.
+        ValueError: A shape or length is wrong, a value is none of its dtype, or `check` objects.
     """
 
     def __post_init__(self) -> None:
         length: int | None = None
         for name, (shape, dtype) in self._columns().items():
             given, where = getattr(self, name), f"{type(self).__name__}.{name}"
-            array = locked(given, dtype)
+            try:
+                array = locked(given, dtype)
+            except (TypeError, ValueError) as error:
+                raise ValueError(f"{where}: {error}") from error
             if dtype.kind in "biu" and not _as_given(array, given):
                 raise ValueError(
                     f"{where} is declared {dtype}, and was given what that cannot hold"
@@ -71,8 +76,7 @@ class Columns:
             if array.shape == (0,):  # an empty list, of which nothing tells the shape of a row
                 array = array.reshape(0, *shape)
             if array.shape[1:] != shape or array.ndim == 0:
-                expected = ", ".join(["N", *map(str, shape)])
-                expected += "" if shape else ","
+                expected = ", ".join(map(str, ("N", *shape))) + ("" if shape else ",")
                 raise ValueError(f"{where} has shape {array.shape}, expected ({expected})")
             if length is not None and len(array) != length:
                 raise ValueError(f"{where} has {len(array)} rows, expected {length}")
@@ -199,8 +203,8 @@ class Locations(Columns):
         """A position is finite exactly where its source is not missing; sizes are positive."""
         self._require(self.source <= max(DepthSource), "the source must be a DepthSource")
         present = self.source != DepthSource.MISSING
-        self._require(_known(self.position) == present, "position must be NaN where missing")
-        self._require(np.isfinite(self.distance) == present, "distance must be NaN where missing")
+        self._require(_known(self.position) == present, f"position {_EXACTLY}")
+        self._require(np.isfinite(self.distance) == present, f"distance {_EXACTLY}")
         self._require(~(self.diameter <= 0), "the diameter must be positive or NaN")
         self._require(~(self.distance < 0), "the distance must not be negative")
         for sigma in (self.sigma_position, self.sigma_diameter):
@@ -291,6 +295,6 @@ class Picks(Columns):
         present = self.source != DepthSource.MISSING
         for name in ("position", "surface"):
             known = _known(getattr(self, name))
-            self._require(known == present, f"{name} must be NaN where missing")
+            self._require(known == present, f"{name} {_EXACTLY}")
         flagged = (self.flags & PickFlag.DEPTH_MISSING) != 0
         self._require(flagged != present, "DEPTH_MISSING must be set exactly where missing")
