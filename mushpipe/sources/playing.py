@@ -192,12 +192,18 @@ class Player:
         try:
             if raw.message.data.startswith(ZSTD):  # no message begins so, CDR begins with 0
                 raise ValueError(_COMPRESSED)
+            if raw.schema and not raw.schema.data:  # it would be decoded to nothing
+                raise ValueError(f"the file lacks the definition of {raw.schema.name}")
             schema = _with_ros2_names(raw.schema)
             for factory in self._factories:
                 decoder = factory.decoder_for(raw.channel.message_encoding, schema)
                 if decoder is not None:
                     return decode(decoder(raw.message.data), raw)
-            raise ValueError(f"message encoding '{raw.channel.message_encoding}' is not supported")
+            raise ValueError(
+                f"message encoding '{raw.channel.message_encoding}' with schema encoding "
+                f"'{schema.encoding if schema else ''}' is not supported (supported: cdr with "
+                "ros2msg, protobuf with protobuf)"
+            )
         except Exception as error:  # whatever a decoder makes of foreign bytes
             if what:
                 self.counts[f"{what} that could not be decoded"] += 1

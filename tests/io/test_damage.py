@@ -302,18 +302,28 @@ def test_garbage_in_place_of_a_jpeg_is_counted(tmp_path: Path) -> None:
     assert "compressed image (rgb8; jpeg compressed bgr8) cannot be decoded" in str(error)
 
 
-def test_an_unknown_message_encoding_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "ros1.mcap"
+@pytest.mark.parametrize(
+    ("message", "schema", "definition", "text"),
+    [
+        ("ros1", "ros1msg", b"x", "message encoding 'ros1' with schema encoding 'ros1msg' is not"),
+        ("cdr", "ros2idl", b"x", "message encoding 'cdr' with schema encoding 'ros2idl' is not"),
+        ("cdr", "ros2msg", b"", "the file lacks the definition of sensor_msgs/msg/Image"),
+    ],
+)
+def test_a_message_that_cannot_be_read_is_told_why(
+    message: str, schema: str, definition: bytes, text: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "odd.mcap"
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
-        schema = writer.register_schema("sensor_msgs/msg/Image", "ros1msg", b"")
-        channel = writer.register_channel(COLOR, "ros1", schema)
+        number = writer.register_schema("sensor_msgs/msg/Image", schema, definition)
+        channel = writer.register_channel(COLOR, message, number)
         writer.add_message(channel, T0, b"\0" * 50, T0)
         writer.finish()
     frames, error = drain(McapSource(path=path))
     assert frames == []
-    assert f"{COLOR}: message encoding 'ros1' is not supported" in str(error)
+    assert f"{COLOR}: {text}" in str(error)
 
 
 def test_messages_that_are_no_ros_messages_are_counted(tmp_path: Path) -> None:
