@@ -41,7 +41,8 @@ def doubts(depth: NDArray[Any]) -> Iterator[str]:
     elif (step := _step(depth)) > COARSE_M:
         yield (
             f"depth comes in steps of {1000 * step:.0f} mm, too coarse for the form of caps, "
-            "which may be missed; record it finer (stereo cameras may have a mode called subpixel)"
+            "which may be missed; record it finer (stereo cameras may have a mode called "
+            "subpixel), or set source.depth_scale where its unit is another"
         )
 
 

@@ -6,10 +6,13 @@ one decoder serves both.
 
 from __future__ import annotations
 
+import re
 import struct
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from mcap.records import Schema
 from numpy.typing import NDArray
 
 from mushpipe.core.geometry import COEFFICIENTS, Camera
@@ -38,6 +41,8 @@ _DEPTH: dict[str, tuple[str, float | None]] = {
 # models in which an angle is a distance from the centre: no pinhole even with coefficients of zero
 _FISHEYE = ("equidistant", "kannala_brandt", "fisheye")
 _PNG = b"\x89PNG"
+_CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+_ROS1_NAME = re.compile(rb"^(float64\[\d*\] +)([DKRP])\b", re.MULTILINE)
 
 
 def _pixels(message: Any, item: int) -> NDArray[np.uint8]:
@@ -188,3 +193,11 @@ def decode_camera(message: Any, rectified: bool) -> Camera | None:
             )
         coefficients = (*d[:count], *[0.0] * (count - len(d)))
     return Camera(message.width, message.height, k[0], k[4], k[2], k[5], model, coefficients)
+
+
+def with_ros2_names(schema: Schema | None) -> Schema | None:
+    """Return a schema that can be read: a bag converted from ROS 1 keeps its D, K, R and P."""
+    if schema is None or schema.name != _CAMERA_INFO or schema.encoding != "ros2msg":
+        return schema
+    names = _ROS1_NAME.sub(lambda found: found[1] + found[2].lower(), schema.data)
+    return replace(schema, data=names)

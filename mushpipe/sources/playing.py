@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import logging
-import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Set
 from dataclasses import replace
 from types import EllipsisType
 from typing import Any, TypeVar
 
-from mcap.records import Schema
 from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoders
 from mcap_ros2.decoder import DecoderFactory as Ros2Decoders
 
@@ -20,7 +18,13 @@ from mushpipe.core.geometry import Camera
 from mushpipe.core.recording import CONVERT, ZSTD, Raw
 from mushpipe.core.types import Header, RgbdFrame
 from mushpipe.sources.doubts import warned
-from mushpipe.sources.images import decode_camera, decode_color, decode_depth, distortion
+from mushpipe.sources.images import (
+    decode_camera,
+    decode_color,
+    decode_depth,
+    distortion,
+    with_ros2_names,
+)
 from mushpipe.sources.pairing import Pairing
 from mushpipe.sources.recorded import RecordedSource
 from mushpipe.sources.topics import Topics, is_beside, says_aligned
@@ -33,8 +37,6 @@ _COMPRESSED = (
     f"{CONVERT.format('ITS_FOLDER')} unpacks them"
 )
 _RECTIFIED = ("rect", "rectified")  # image_rect_color, as ROS has it; others say image_color_rect
-_CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-_ROS1_NAME = re.compile(rb"^(float64\[\d*\] +)([DKRP])\b", re.MULTILINE)
 
 
 class Player:
@@ -107,6 +109,12 @@ class Player:
             yield from map(self._with_beside, ready)
             ready = list(self._take(raw, pairing))
         yield from map(self._with_beside, (*ready, *self._frames(pairing.finish())))
+        if min(pairing.color_alone, pairing.depth_alone) > self.frames / 2:
+            self._warn(
+                f"most colour and depth images are without a partner: their stamps differ by more "
+                f"than source.pair_tolerance_ms, {self.settings.pair_tolerance_ms:g}; where one of "
+                "both is only later, set it higher"
+            )
         self.counts["colour images without depth"] += pairing.color_alone
         self.counts["depth images without colour"] += pairing.depth_alone
 
@@ -194,7 +202,7 @@ class Player:
                 raise ValueError(_COMPRESSED)
             if raw.schema and not raw.schema.data:  # it would be decoded to nothing
                 raise ValueError(f"the file lacks the definition of {raw.schema.name}")
-            schema = _with_ros2_names(raw.schema)
+            schema = with_ros2_names(raw.schema)
             for factory in self._factories:
                 decoder = factory.decoder_for(raw.channel.message_encoding, schema)
                 if decoder is not None:
@@ -276,14 +284,6 @@ class Player:
 _Calibration = Camera | None | EllipsisType  # which is that nothing was stated yet
 _Color = tuple[Header, Any, _Calibration]
 _Depth = tuple[str, Any, float]
-
-
-def _with_ros2_names(schema: Schema | None) -> Schema | None:
-    """Return a schema that can be read: a bag converted from ROS 1 keeps its D, K, R and P."""
-    if schema is None or schema.name != _CAMERA_INFO or schema.encoding != "ros2msg":
-        return schema
-    names = _ROS1_NAME.sub(lambda found: found[1] + found[2].lower(), schema.data)
-    return replace(schema, data=names)
 
 
 def _stamp(message: Any, raw: Raw) -> tuple[int, str]:

@@ -58,13 +58,24 @@ def test_stamps_may_differ_a_little(delay_ms: int, tmp_path: Path) -> None:
     assert [f.header.stamp_ns for f in frames] == [T0 + i * PERIOD for i in range(5)]
 
 
-def test_stamps_that_differ_too_much_are_not_paired_but_counted(tmp_path: Path) -> None:
+def test_stamps_that_differ_too_much_are_not_paired_but_counted(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     entries: list[Entry] = []
     for i in range(3):
         entries += [color_at(i), depth_at(i, T0 + i * PERIOD + 16 * MS)]
     frames, counts = run(tmp_path, entries, pair_tolerance_ms=15)
     assert partners(frames) == [(0, None), (1, None), (2, None)]
     assert counts == {ALONE: 3, LEFT: 3}
+    assert "their stamps differ by more than source.pair_tolerance_ms, 15" in caplog.text
+
+
+def test_a_few_images_without_a_partner_are_no_reason_for_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    entries = [color_at(0), depth_at(1), color_at(2), depth_at(2), color_at(3), depth_at(3)]
+    assert run(tmp_path, entries)[1] == {ALONE: 1, LEFT: 1}
+    assert "pair_tolerance_ms" not in caplog.text
 
 
 def test_the_tolerance_is_a_setting(tmp_path: Path) -> None:
