@@ -21,6 +21,7 @@ from mushpipe.core.paths import resolve_path
 from mushpipe.core.tables import Floats
 
 UNIT_TOLERANCE = 1e-3
+_EXPECTED = "frame, translation: [x, y, z] in m and quaternion: [x, y, z, w]"
 REACH = 50.0  # m, of a robot from its camera
 
 
@@ -87,6 +88,8 @@ def _read(value: Any, info: ValidationInfo) -> Any:
     """Replace the name of a YAML file by the transform that stands in it."""
     if isinstance(value, dict):  # a list is no tuple to a validator that follows another
         return {key: tuple(v) if isinstance(v, list) else v for key, v in value.items()}
+    if isinstance(value, list):
+        raise ValueError(f"it is a list, or matrix; expected {_EXPECTED}, or a YAML file of these")
     if not isinstance(value, str):
         return value
     import json
@@ -104,10 +107,7 @@ def _read(value: Any, info: ValidationInfo) -> Any:
             what = (
                 f"{'.'.join(map(str, first['loc']))}: {first['msg'].removeprefix('Value error, ')}"
             )
-        raise ValueError(
-            f"no transform in {path}: {what}; expected frame, translation: [x, y, z] in m and "
-            "quaternion: [x, y, z, w]"
-        ) from error
+        raise ValueError(f"no transform in {path}: {what}; expected {_EXPECTED}") from error
 
 
 TransformSetting = Annotated[
