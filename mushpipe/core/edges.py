@@ -13,6 +13,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from mushpipe.core.doubts import judged
 from mushpipe.core.errors import MushpipeError, PluginError, StageError
 from mushpipe.core.mailbox import Mailbox
 from mushpipe.core.plan import Node, Plan
@@ -211,7 +212,8 @@ class SourceThread(threading.Thread):
         frames = self.source.frames()
         timed_frames = timed(frames, self.durations)
         try:
-            for frame in limited(paced(timed_frames, speed, self.stop), self.source):
+            seen = judged(paced(timed_frames, speed, self.stop), self.source.name())
+            for frame in limited(seen, self.source):
                 if self.stop.is_set() or not self.box.put((frame, time.perf_counter_ns())):
                     break
         finally:

@@ -18,7 +18,6 @@ from pydantic import Field, PrivateAttr, field_validator, model_validator
 from mushpipe import Header, InputError, ReplaySource, RgbdFrame, UsageError
 from mushpipe.core.paths import GraphPath
 from mushpipe.core.types import COLOR_FRAME
-from mushpipe.sources.doubts import warned
 from mushpipe.sources.recorded import NO_CAMERA, NO_DEPTH, Intrinsics
 
 logger = logging.getLogger("mushpipe")
@@ -101,12 +100,9 @@ class ImagesSource(ReplaySource):
             logger.warning(NO_DEPTH, self.name())
         if self.camera is None:
             logger.warning(NO_CAMERA, self.name(), "")
-        judged = False
         for sequence, (color, depth) in enumerate(self._found):
             header = Header(round(sequence * 1e9 / self.fps), sequence, COLOR_FRAME)
-            frame = self._frame(header, color, depth)
-            judged = judged or warned(self.name(), frame)
-            yield frame
+            yield self._frame(header, color, depth)
 
     def _pairs(self) -> list[tuple[Path, Path | None]]:
         """Return each colour image with its depth image, and count those that are alone."""

@@ -17,7 +17,6 @@ from mushpipe.core.errors import InputError
 from mushpipe.core.geometry import Camera
 from mushpipe.core.recording import CONVERT, ZSTD, Raw
 from mushpipe.core.types import Header, RgbdFrame
-from mushpipe.sources.doubts import warned
 from mushpipe.sources.images import (
     decode_camera,
     decode_color,
@@ -80,7 +79,6 @@ class Player:
         self._factories = (ProtobufDecoders(), Ros2Decoders())
         self._calibrated = ""  # frame of the calibration
         self._stated = False  # whether there was a calibration, or word that there is none
-        self._judged = False  # whether there was depth to be judged
         self._warned: set[str] = set()
         self._found_beside: dict[tuple[int, int], dict[str, wire.Message]] = {}
 
@@ -250,11 +248,9 @@ class Player:
         self._watch_size(image.shape[:2], sequence)
         try:
             native, scale = depth[1:] if depth else (None, 0.001)
-            frame = RgbdFrame(header, image, native, scale, self._camera(image.shape[:2], camera))
+            return RgbdFrame(header, image, native, scale, self._camera(image.shape[:2], camera))
         except ValueError as error:
             raise InputError(f"{self.name}, frame {sequence}: {error}") from error
-        self._judged = self._judged or warned(self.name, frame)
-        return frame
 
     def _check_calibration(self, frame_id: str) -> None:
         """Refuse the calibration of another camera, unless it was named or stands beside colour."""

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import logging
 import re
+from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mushpipe.sources.doubts import doubts
+from mushpipe import Camera, Header, RgbdFrame
+from mushpipe.core.doubts import doubts
+from tests.core.lab import Frames, Lab
 from tests.stages.frames import recorded
 
+COLOR = np.zeros((48, 64, 3), np.uint8)
 RELIEF = np.random.default_rng(0).uniform(0.4, 0.5, 4800)  # m, a bed and its caps
 
 
@@ -50,3 +56,43 @@ def test_depths_that_are_few_and_far_apart_by_chance_are_not_doubted(seed: int, 
 def test_real_depth_is_not_doubted(name: str) -> None:
     for frame in recorded(name):
         assert not list(doubts(frame.depth_m[np.isfinite(frame.depth_m)]))
+
+
+GOOD = Camera(64, 48, 60, 60, 32, 24)
+
+
+@pytest.mark.parametrize(
+    ("depth", "scale", "camera", "message"),
+    [
+        (np.full((48, 64), 500, np.float32), 1, GOOD, "half of the depth is beyond 500 m"),
+        (
+            np.full((48, 64), 0.4, np.float32),
+            0.001,
+            GOOD,
+            "half of the depth is nearer than 0.4 mm",
+        ),
+        (np.full((48, 64), 500, np.uint16), 0.001, Camera(64, 48, 2, 2, 32, 24), "view of 173 deg"),
+        (np.full((48, 64), 500, np.uint16), 0.001, GOOD, ""),
+        (np.zeros((48, 64), np.uint16), 0.001, GOOD, ""),
+        (None, 0.001, GOOD, ""),
+    ],
+)
+def test_any_source_is_told_once_of_units_that_cannot_be(
+    depth: np.ndarray | None,
+    scale: float,
+    camera: Camera,
+    message: str,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    class Own(Frames):
+        def frames(self) -> Iterator[RgbdFrame]:
+            for k in range(3):
+                yield RgbdFrame(Header(k, k, "camera"), COLOR, depth, scale, camera)
+
+    lab = Lab(tmp_path)
+    lab.registry.source("own", Own)
+    with caplog.at_level(logging.WARNING, "mushpipe"):
+        assert lab.run(lab.chain("threshold", source="own")).error is None
+    assert caplog.text.count("frame 0: ") == len(caplog.messages) == (1 if message else 0)
+    assert message in caplog.text

@@ -240,13 +240,3 @@ def test_depth_needs_its_unit_and_names_one_star(tmp_path: Path) -> None:
             ImagesSource(path=tmp_path, color=names)
     with pytest.raises(ValidationError, match="expected names as seen from the folder"):
         ImagesSource(path=tmp_path, color=f"{tmp_path}/rgb/*.png")
-
-
-def test_millimetres_taken_for_metres_are_told_of(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    write(tmp_path / "c0.png", 1)
-    write(tmp_path / "d0.png", 470, np.uint16, 1)
-    (frame,) = played(tmp_path, color="c*.png", depth="d*.png", depth_scale=1)
-    assert "set source.depth_scale: 0.001" in caplog.text
-    assert frame.depth_m[0, 0] == 470

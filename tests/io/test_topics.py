@@ -15,10 +15,8 @@ from tests.io.bags import (
     CAMERA,
     COLOR,
     COLOR_INFO,
-    HEIGHT,
     RECT,
     T0,
-    WIDTH,
     Entry,
     camera_info,
     color_at,
@@ -219,19 +217,6 @@ def test_the_calibration_of_another_camera_is_refused_unless_it_is_named(
 def test_the_calibration_of_an_infrared_camera_is_not_that_of_colour(tmp_path: Path) -> None:
     entries = [(CAMERA + "infra1/camera_info", T0, OTHER_INFO), color_at(0)]
     assert first(tmp_path, entries).camera is None
-
-
-def test_depth_beyond_any_bed_is_warned_of(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    far = raw_image(np.full((HEIGHT, WIDTH), 513, np.float32), "32FC1")
-    entries = [(COLOR_INFO, T0, camera_info()), color_at(0), (ALIGNED, T0 + 1, far)]
-    first(tmp_path / "a", entries)
-    assert "half of the depth is beyond 513 m; where it is in millimetres" in caplog.text
-    caplog.clear()
-    frame = first(tmp_path / "b", entries, depth_scale=0.001)
-    assert frame.depth_m == pytest.approx(0.513)
-    assert not caplog.messages
 
 
 def test_unaligned_depth_may_be_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -1,0 +1,84 @@
+"""What speaks against depth and calibration before anything is measured by them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mushpipe.core.geometry import Camera
+from mushpipe.core.types import RgbdFrame, end_of_scale
+
+logger = logging.getLogger("mushpipe")
+NEAREST_M, FARTHEST_M = 0.02, 30.0
+COARSE_M = 0.003  # a cap of 30 mm rises by 9
+WIDEST_DEG = 160.0
+_FEWEST_LEVELS = 6
+_FEWEST_EACH = 8  # depths a level: unlike steps, chance seldom meets a level twice
+
+
+def judged(frames: Iterator[RgbdFrame], name: str) -> Iterator[RgbdFrame]:
+    """Pass frames on, and warn of the first that has depth where that is odd."""
+    done = False
+    for frame in frames:
+        done = done or _warned(name, frame)
+        yield frame
+
+
+def _warned(name: str, frame: RgbdFrame) -> bool:
+    """Warn of a frame where it is odd; return whether there is any depth to judge it by."""
+    if frame.depth is None:
+        return False
+    depth = frame.depth[::8, ::8]
+    known = depth[(depth > 0) & (depth < end_of_scale(depth))] * frame.depth_scale
+    if not len(known):
+        return False
+    for doubt in (*doubts(known), *doubts_of_camera(frame.camera)):
+        logger.warning("%s, frame %d: %s", name, frame.header.sequence, doubt)
+    return True
+
+
+def doubts(depth: NDArray[Any]) -> Iterator[str]:
+    """Yield what is odd about depths (N,), m, none of them missing, and what to do about it."""
+    if not len(depth):
+        return
+    middle = float(np.median(depth))
+    if middle > FARTHEST_M:
+        yield (
+            f"half of the depth is beyond {middle:.0f} m; where it is in millimetres, set "
+            "source.depth_scale: 0.001"
+        )
+    elif middle < NEAREST_M:
+        yield (
+            f"half of the depth is nearer than {1000 * middle:.2g} mm; where it is in metres, set "
+            "source.depth_scale: 1"
+        )
+    elif (step := _step(depth)) > COARSE_M:
+        yield (
+            f"depth comes in steps of {1000 * step:.0f} mm, too coarse for the form of caps, "
+            "which may be missed; record it finer (stereo cameras may have a mode called "
+            "subpixel), or set source.depth_scale where its unit is another"
+        )
+
+
+def doubts_of_camera(camera: Camera | None) -> Iterator[str]:
+    """Yield what is odd about a calibration, and what to do about it."""
+    if camera is None:
+        return
+    view = float(np.degrees(2 * np.arctan2(camera.width / 2, camera.fx)))
+    if view > WIDEST_DEG:
+        yield (
+            f"a focal length of {camera.fx:g} px makes a view of {view:.0f} degrees; where it is "
+            "in millimetres, state it in px: mm / width of the sensor in mm x width of the image"
+        )
+
+
+def _step(depth: NDArray[Any]) -> float:
+    """Return the usual step between depths (N,), m; 0 where they are too few to tell."""
+    levels = np.unique(depth)
+    if not _FEWEST_LEVELS <= len(levels) <= len(depth) / _FEWEST_EACH:
+        return 0.0
+    return float(np.median(np.diff(levels)))
