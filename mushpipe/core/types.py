@@ -89,6 +89,11 @@ class RgbdFrame:
     attached: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        for name, kind in (("header", Header), ("camera", Camera | None)):
+            if not isinstance(value := getattr(self, name), kind):
+                raise TypeError(
+                    f"{name} of a frame is of type {type(value).__name__}, expected {name.title()}"
+                )
         color = locked(self.color, None)
         if color.dtype != np.uint8 or color.ndim != 3 or color.shape[2] != 3 or not color.size:
             raise ValueError(f"color is {color.dtype}{color.shape}, expected uint8 (H, W, 3)")
@@ -112,7 +117,7 @@ class RgbdFrame:
                 f"depth has shape {depth.shape}, colour {self.color.shape[:2]}: "
                 "depth must be aligned to colour"
             )
-        if not self.depth_scale > 0:
+        if not (isinstance(self.depth_scale, int | float | np.number) and self.depth_scale > 0):
             raise ValueError(f"depth_scale is {self.depth_scale}, expected metres per unit > 0")
         object.__setattr__(self, "depth", depth)
 

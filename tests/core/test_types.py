@@ -147,3 +147,18 @@ def test_a_mask_that_cannot_be(foreground, initial, message):
 def test_a_header_that_no_recording_could_hold_is_refused(values: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Header(*values)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"header": None}, "header of a frame is of type NoneType, expected Header"),
+        ({"camera": np.eye(3)}, "camera of a frame is of type ndarray, expected Camera"),
+        ({"depth_scale": None}, "depth_scale is None, expected metres per unit > 0"),
+    ],
+)
+def test_a_frame_of_something_else_is_refused_by_name(values: Any, message: str) -> None:
+    given = {"header": Header(0, 0, "c"), "color": np.zeros((2, 3, 3), np.uint8)}
+    given |= {"depth": np.ones((2, 3), np.uint16)} | values
+    with pytest.raises((TypeError, ValueError), match=message):
+        RgbdFrame(**given)
