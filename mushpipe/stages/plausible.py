@@ -31,6 +31,7 @@ def require_plausible(
         _require_in_front(points, what)
         if camera is not None:
             _require_same(circles, camera.project(points), what)
+    _require_distance(locations)
     if camera is not None:
         _require_size(circles, locations, poses, camera)
 
@@ -56,11 +57,20 @@ def _require_same(circles: Circles, seen: NDArray[np.float64], what: str) -> Non
         )
 
 
+def _require_distance(locations: Locations) -> None:
+    """Raise ValueError where a distance is not that of the position."""
+    away = lengths(locations.position)
+    if (row := _first(_differ(locations.distance, away))) is not None:
+        raise ValueError(
+            f"row {row}: its distance is {locations.distance[row]:.3g} m, but its location is "
+            f"{away[row]:.3g} m from the camera: {_METRES}"
+        )
+
+
 def _require_size(circles: Circles, locations: Locations, poses: Poses, camera: Camera) -> None:
     """Raise ValueError where a diameter, or the way to an apex, is far from the circle's size."""
     across = 2 * circles.radius * locations.position[:, 2] / np.sqrt(camera.fx * camera.fy)
-    ratio = locations.diameter / across
-    if (row := _first((ratio > UNIT) | (ratio < 1 / UNIT))) is not None:
+    if (row := _first(_differ(locations.diameter, across))) is not None:
         raise ValueError(
             f"row {row}: its diameter is {locations.diameter[row]:.3g} m, but its circle is "
             f"{across[row]:.3g} m wide at its location: {_METRES}"
@@ -71,6 +81,11 @@ def _require_size(circles: Circles, locations: Locations, poses: Poses, camera: 
             f"row {row}: the apex of its pose is {way[row]:.3g} m from its location, but its "
             f"circle is {across[row]:.3g} m wide there: {_METRES}"
         )
+
+
+def _differ(given: NDArray[np.float64], seen: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return where two lengths (N,) differ as lengths of different units do."""
+    return np.asarray((given > UNIT * seen) | (seen > UNIT * given))
 
 
 def _first(wrong: NDArray[np.bool_]) -> int | None:

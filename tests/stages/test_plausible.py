@@ -32,8 +32,8 @@ def poses(apex: np.ndarray) -> Poses:
         (POSITION * 0, 1, r"row 0: its location is at .*0, 0\), which is not in front"),
         (-POSITION, 1, r"its location is at .*, which is not in front of the camera"),
         (POSITION, 1000, "row 0: its diameter is .* m, but its circle is .* m wide"),
-        (POSITION * 1000, 1, "row 0: its diameter is .* in metres"),
-        (POSITION * 100, 1, "row 0: its diameter is .* in metres"),
+        (POSITION * 1000, 1, "row 0: its distance is .* in metres"),
+        (POSITION * 100, 1, "row 0: its distance is .* in metres"),
     ],
 )
 def test_a_location_that_no_camera_sees_is_refused(
@@ -41,6 +41,12 @@ def test_a_location_that_no_camera_sees_is_refused(
 ) -> None:
     wrong = replace(LOCATIONS, position=position, diameter=LOCATIONS.diameter * diameter)
     with pytest.raises(ValueError, match=message):
+        MakePicks().process(FRAME, CIRCLES, wrong)
+
+
+def test_a_distance_in_another_unit_is_refused() -> None:
+    wrong = replace(LOCATIONS, distance=LOCATIONS.distance * 1000)
+    with pytest.raises(ValueError, match=r"row 0: its distance is .* m, but its location is"):
         MakePicks().process(FRAME, CIRCLES, wrong)
 
 
