@@ -63,7 +63,9 @@ def choose_topics(
     if not use_depth:
         depth = None
     elif depth is None:
-        depth = _one(path, "depth", _depths(images))
+        depths = _depths(images)
+        own = [t for t in depths if not _other_camera(t, color)]
+        depth = _one(path, "depth", own or depths)
         if depth and _other_camera(depth, color):
             raise InputError(
                 f"{path}: by its name, depth ({depth}) is of another camera than colour ({color}): "

@@ -130,9 +130,17 @@ def test_of_several_cameras_one_must_be_chosen(tmp_path: Path) -> None:
     )
 
 
-def test_the_depth_of_several_cameras_must_be_chosen_too(tmp_path: Path) -> None:
-    text = refusal(tmp_path, two_cameras(), color_topic=RIGHT)
-    assert f"--set source.depth_topic={RIGHT_DEPTH}" in text
+def test_with_its_colour_the_depth_of_a_camera_is_chosen(tmp_path: Path) -> None:
+    frame = first(tmp_path, two_cameras(), color_topic=RIGHT)
+    np.testing.assert_array_equal(frame.color, color_pixels(2))
+    np.testing.assert_array_equal(frame.depth, depth_pixels(2))
+
+
+def test_of_several_depths_of_one_camera_one_must_be_chosen(tmp_path: Path) -> None:
+    filtered = RIGHT_DEPTH.replace("/aligned", "/filtered/aligned")
+    entries = [*two_cameras(), depth_at(3, topic=filtered)]
+    text = refusal(tmp_path, entries, color_topic=RIGHT)
+    assert f"--set source.depth_topic={RIGHT_DEPTH} or --set source.depth_topic={filtered}" in text
 
 
 def test_named_topics_are_taken_as_they_are(tmp_path: Path) -> None:
