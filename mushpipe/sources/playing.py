@@ -35,6 +35,10 @@ _COMPRESSED = (
     "each message is compressed (ros2 bag record --compression-mode message): "
     f"{CONVERT.format('ITS_FOLDER')} unpacks them"
 )
+_ALIGN = (
+    "depth must be aligned to colour; record aligned_depth_to_color, or play without depth: "
+    "--set source.use_depth=false"
+)
 _RECTIFIED = ("rect", "rectified")  # image_rect_color, as ROS has it; others say image_color_rect
 
 
@@ -241,9 +245,12 @@ class Player:
         if depth and depth[0] != header.frame_id and not aligned:
             raise InputError(
                 f"{self.name}: depth ({self.topics.depth}) is in frame '{depth[0]}', "
-                f"colour in '{header.frame_id}': depth must be aligned to colour; record "
-                "aligned_depth_to_color, or play without depth: --set source.use_depth=false"
+                f"colour in '{header.frame_id}': {_ALIGN}"
             )
+        if depth and depth[1].shape != image.shape[:2]:
+            (h, w), (high, wide) = depth[1].shape, image.shape[:2]
+            sizes = f"depth ({self.topics.depth}) is {w}x{h}, colour {wide}x{high}"
+            raise InputError(f"{self.name}, frame {sequence}: {sizes}: {_ALIGN}")
         self._check_calibration(header.frame_id)
         self._watch_size(image.shape[:2], sequence)
         try:

@@ -275,7 +275,8 @@ def test_rectified_depth_in_the_frame_of_the_colour_is_taken(tmp_path: Path) -> 
 def test_aligned_depth_of_another_size_is_refused(tmp_path: Path) -> None:
     small = raw_image(depth_pixels(0, (4, 3)), "16UC1")
     text = refusal(tmp_path, [color_at(0), (ALIGNED, T0 + 1, small)])
-    assert "frame 0: depth has shape (3, 4), colour (6, 8)" in text
+    assert f"frame 0: depth ({ALIGNED}) is 4x3, colour 8x6: depth must be aligned" in text
+    assert "--set source.use_depth=false" in text
 
 
 @pytest.mark.parametrize(
