@@ -8,7 +8,6 @@ with depth and `cap-fit` after it, as in graphs/classic.yaml.
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,9 @@ from typing import Any
 import numpy as np
 
 from mushpipe import Circles, Mask, RgbdFrame
+from mushpipe.core.truth import Ignore
 from mushpipe.evaluate.matching import circle_iou
+from mushpipe.evaluate.truth import read_truth
 from mushpipe.sources.mcap import McapSource
 from mushpipe.stages.phase_hough import PhaseHough
 from training.judge import LEAST, kept
@@ -30,33 +31,21 @@ RANGES: dict[str, dict[str, Any]] = {
 }
 
 
-def labelled(labels: dict[str, Any], stamp_ns: int) -> tuple[Floats, Floats] | None:
-    """Return circles (N, 3) that must and circles (M, 3) that may be found; None if unlabelled."""
-    must, may = [], []
-    if "must_find" in labels:
-        must = [(c["cx"], c["cy"], c["diam_silhouette"] / 2) for c in labels["must_find"]]
-        may = [(c["cx"], c["cy"], c["r"]) for c in labels["may_find"]]
-    elif "frames" in labels:
-        frame = next(f for f in labels["frames"] if f["stamp_ns"] == stamp_ns)
-        boxes = [c["bbox"] for c in frame["caps"]]
-        must = [(x + w / 2, y + h / 2, np.sqrt(w * h) / 2) for x, y, w, h in boxes]
-    elif labels["stamp_ns"] != stamp_ns:
-        return None
-    else:
-        for cap in labels["caps"]:
-            (may if cap["ignore"] else must).append((cap["u"], cap["v"], cap["radius_px"]))
-    return np.array(must).reshape(-1, 3), np.array(may).reshape(-1, 3)
-
-
 def labelled_frames(path: Path) -> Iterator[tuple[RgbdFrame, Floats, Floats]]:
-    """Yield the frames of a recording that have labels beside it, with these as by `labelled`."""
-    labels = json.loads(path.with_suffix(".labels.json").read_text())
+    """Yield the frames of a recording that have labels beside it.
+
+    With each come the circles (N, 3) that must and those (M, 3) that may be found, px.
+    """
+    truth = read_truth(path.with_suffix(".labels.json"))
     source = McapSource(path=path)
     source.open()
     for frame in source.frames():
-        wanted = labelled(labels, frame.header.stamp_ns)
-        if wanted is not None:
-            yield frame, *wanted
+        if (place := truth.place(frame.header)) is not None:
+            labels = truth.frames[place]
+            circles = np.column_stack([labels.caps.center, labels.caps.radius])
+            # How far one at the border goes on beyond it is guessed; that it is a cap is not.
+            must = np.isin(labels.caps.ignore, (Ignore.COUNTS, Ignore.AT_BORDER))
+            yield frame, circles[must], np.concatenate([circles[~must], labels.may_find])
 
 
 def found_and_false(circles: Circles, must: Floats, may: Floats) -> tuple[int, int]:
