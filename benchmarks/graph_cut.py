@@ -9,16 +9,15 @@ import math
 
 import maxflow
 import numpy as np
-from numpy.typing import NDArray
+
+from mushpipe.core.arrays import Bools, Singles
 
 ROUNDS = 4  # of alternation, at most
 AXIAL = np.array([[0, 0, 0], [0, 0, 1], [0, 1, 0]])
 DIAGONAL = np.array([[0, 0, 0], [0, 0, 0], [1, 0, 1]])
 
 
-def graph_cut(
-    gray: NDArray[np.float32], initial: NDArray[np.bool_], mu: float
-) -> NDArray[np.bool_]:
+def graph_cut(gray: Singles, initial: Bools, mu: float) -> Bools:
     """Return the region of least energy, alternating with its means from an initial region on.
 
     Args:

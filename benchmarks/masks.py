@@ -15,9 +15,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mushpipe import RgbdFrame
+from mushpipe.core.arrays import Bools, Bytes
 from mushpipe.core.truth import INSTANCES_TOPIC
 from mushpipe.sources.synthetic import SyntheticSource
 from mushpipe.stages.chan_vese import ChanVese
@@ -27,8 +27,6 @@ from mushpipe.stages.kmeans import KMeans
 from mushpipe.stages.opening import Opening
 from mushpipe.stages.otsu import Otsu
 
-Region = NDArray[np.bool_]
-Image = NDArray[np.uint8]
 EMPTY: dict[str, Any] = {"count": 0, "pins": 1, "stumps": 0}
 CONDITIONS: dict[str, dict[str, Any]] = {
     "even": {},
@@ -85,7 +83,7 @@ def bed(seed: int, family: str, scene: dict[str, Any]) -> RgbdFrame:
     return next(source.frames())
 
 
-def segmented(frame: RgbdFrame, opening: Opening) -> dict[str, Region]:
+def segmented(frame: RgbdFrame, opening: Opening) -> dict[str, Bools]:
     """Return the mask of each segmenter."""
     flat = Flatten().process(frame)
     return {
@@ -94,7 +92,7 @@ def segmented(frame: RgbdFrame, opening: Opening) -> dict[str, Region]:
     }
 
 
-def row(name: str, frames: list[RgbdFrame], masks: list[dict[str, Region]]) -> str:
+def row(name: str, frames: list[RgbdFrame], masks: list[dict[str, Bools]]) -> str:
     """Return a row of the table."""
     figures = []
     for segmenter in SEGMENTERS:
@@ -103,25 +101,25 @@ def row(name: str, frames: list[RgbdFrame], masks: list[dict[str, Region]]) -> s
     return f"| {name} | " + " | ".join(figures) + " |"
 
 
-def truth(frame: RgbdFrame) -> Region:
+def truth(frame: RgbdFrame) -> Bools:
     """Return the pixels of all mushrooms."""
     return np.asarray(frame.attached[INSTANCES_TOPIC].labels > 0)
 
 
-def score(mask: Region, true: Region) -> float:
+def score(mask: Bools, true: Bools) -> float:
     """Return the IoU, or the share of the image that is covered where next to nothing is there."""
     if true.mean() < 0.001:
         return float(mask.mean())
     return float((mask & true).sum() / max(1, (mask | true).sum()))
 
 
-def strip(name: str, frame: RgbdFrame, masks: dict[str, Region]) -> Image:
+def strip(name: str, frame: RgbdFrame, masks: dict[str, Bools]) -> Bytes:
     """Return a row of the contact sheet: the frame, then each mask's contour; truth in yellow."""
     tiles = [tile(frame, np.zeros_like(truth(frame)), name)]
     return np.hstack(tiles + [tile(frame, mask, "") for mask in masks.values()])
 
 
-def tile(frame: RgbdFrame, mask: Region, text: str, width: int = 128) -> Image:
+def tile(frame: RgbdFrame, mask: Bools, text: str, width: int = 128) -> Bytes:
     """Return a small picture: what is found in green, what is missed in blue, invented in red."""
     image = frame.color[..., ::-1].astype(np.float32)
     true = truth(frame)
@@ -135,7 +133,7 @@ def tile(frame: RgbdFrame, mask: Region, text: str, width: int = 128) -> Image:
     return np.asarray(small, np.uint8)
 
 
-def header(width: int = 128) -> Image:
+def header(width: int = 128) -> Bytes:
     """Return the row of names above the contact sheet."""
     titles = []
     for name in ("", *SEGMENTERS):

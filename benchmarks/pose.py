@@ -16,10 +16,10 @@ from typing import cast
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 from pose_scenes import frames, true_circles
 
 from mushpipe import Camera, Circles, DepthSource
+from mushpipe.core.arrays import Floats
 from mushpipe.core.libraries import import_open3d
 from mushpipe.stages.cap_attempt import ODD
 from mushpipe.stages.cap_fit import CapFit
@@ -31,7 +31,6 @@ from mushpipe.stages.registration import Registration
 SCENE = {"distance": 0.65, "size_mm": (20, 50), "tilt_deg": (0, 25), "count": 240, "cluster": 0.5}
 SEED = 7
 ROUNDS = 8  # in which the calls take turns
-Floats = NDArray[np.float64]
 
 
 def milliseconds(calls: dict[str, tuple[Callable[[], object], int]]) -> dict[str, Floats]:

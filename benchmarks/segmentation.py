@@ -22,9 +22,9 @@ from typing import Any, TypeVar
 import cv2
 import numpy as np
 from graph_cut import graph_cut
-from numpy.typing import NDArray
 
 from mushpipe import RgbdFrame
+from mushpipe.core.arrays import Bools, Singles
 from mushpipe.sources.mcap import McapSource
 from mushpipe.sources.synthetic import SyntheticSource
 from mushpipe.stages.chan_vese import ChanVese
@@ -35,8 +35,6 @@ from mushpipe.stages.kmeans import KMeans
 from mushpipe.stages.opening import Opening
 from mushpipe.stages.otsu import Otsu, otsu_foreground
 
-Plane = NDArray[np.float32]
-Region = NDArray[np.bool_]
 T = TypeVar("T")
 MU = 0.1
 SEED = 7000
@@ -89,14 +87,14 @@ def bed(number: int) -> RgbdFrame:
     return next(SyntheticSource(seed=SEED + number, max_frames=1, **scene).frames())
 
 
-def resized(gray: Plane) -> Plane:
+def resized(gray: Singles) -> Singles:
     """Return an image at 640 x 480 px."""
     if gray.shape == (480, 640):
         return gray
     return np.asarray(cv2.resize(gray, (640, 480), interpolation=cv2.INTER_AREA), np.float32)
 
 
-def solvers(title: str, images: list[Plane], few: int) -> None:
+def solvers(title: str, images: list[Singles], few: int) -> None:
     """Print time and energy of each solver on some images."""
     lowest = [
         chan_vese_energy(image, graph_cut(image, otsu_foreground(image), MU), MU)
@@ -119,7 +117,7 @@ def solvers(title: str, images: list[Plane], few: int) -> None:
 
 
 def measured(
-    stage: ChanVese | None, images: list[Plane], lowest: list[float], repeats: int
+    stage: ChanVese | None, images: list[Singles], lowest: list[float], repeats: int
 ) -> tuple[float, list[float]]:
     """Return the mean time of a solver, ms, and the energy of each result over the lowest."""
     done = [timed(partial(solve, stage, image), repeats) for image in images]
@@ -130,7 +128,7 @@ def measured(
     return 1e3 * float(np.mean([seconds for _, seconds in done])), ratios
 
 
-def solve(stage: ChanVese | None, image: Plane) -> Region:
+def solve(stage: ChanVese | None, image: Singles) -> Bools:
     """Run a solver from Otsu's start."""
     initial = otsu_foreground(image)
     if stage is not None and stage.solver == "pde":
@@ -138,7 +136,7 @@ def solve(stage: ChanVese | None, image: Plane) -> Region:
     return initial if stage is None else stage.solve(image, initial)
 
 
-def mu_stretched(image: Plane, mu: float) -> float:
+def mu_stretched(image: Singles, mu: float) -> float:
     """Return the weight with which scikit-image, which stretches images to 0..1, minimises E."""
     return mu / float(np.ptp(image)) ** 2
 

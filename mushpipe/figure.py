@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Bools, Floats
 from mushpipe.core.errors import UsageError
-from mushpipe.core.tables import Circles, Floats, Locations
+from mushpipe.core.tables import Circles, Locations
 from mushpipe.core.types import Mask, RgbdFrame, Trace
 
 if TYPE_CHECKING:
@@ -220,7 +221,7 @@ def _lay_out_clouds(alignments: list[Alignment]) -> Figure:
     return figure
 
 
-def _contour(axes: Axes, mask: NDArray[np.bool_]) -> None:
+def _contour(axes: Axes, mask: Bools) -> None:
     axes.contour(mask, levels=[0.5], colors=GREEN, linewidths=0.9)
 
 

@@ -16,14 +16,12 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mushpipe import RgbdFrame
+from mushpipe.core.arrays import Bytes, Floats
 from training.field import found_and_false, labelled_frames
-from training.matching import Floats
 from training.net.judge import both
 
-Bytes = NDArray[np.uint8]
 SCALES = (0.6, 0.75, 1.3)
 
 

@@ -15,13 +15,14 @@ from typing import Any
 import numpy as np
 
 from mushpipe import Circles, Mask, RgbdFrame
+from mushpipe.core.arrays import Floats
 from mushpipe.core.truth import Ignore
 from mushpipe.evaluate.matching import circle_iou
 from mushpipe.evaluate.truth import read_truth
 from mushpipe.sources.mcap import McapSource
 from mushpipe.stages.phase_hough import PhaseHough
 from training.judge import LEAST, kept
-from training.matching import IOU, Floats
+from training.matching import IOU
 from training.verifier import segmentations
 
 RANGES: dict[str, dict[str, Any]] = {

@@ -14,9 +14,9 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mushpipe import Circles, RgbdFrame
+from mushpipe.core.arrays import Bools, Floats
 from mushpipe.core.truth import Truth
 from mushpipe.evaluate.matching import circle_iou
 from mushpipe.stages.cap_fit import CapFit
@@ -25,7 +25,7 @@ from mushpipe.stages.cap_verify import FILE, FIT, MODELS, NAMES, features, flat
 from mushpipe.stages.phase_hough import PhaseHough
 from mushpipe.stages.verifier import LIMIT
 from training.harder import harder
-from training.logistic import Floats, fit, write
+from training.logistic import fit, write
 from training.matching import counted, matched
 from training.net.scenes import VERIFIER_SEED, varied_cases
 from training.scenes import more_cases, training_cases
@@ -82,7 +82,7 @@ def samples(cache: Path) -> tuple[Floats, Floats]:
     return np.concatenate(rows), np.concatenate(right)
 
 
-def teaches(rows: Floats, names: Sequence[str]) -> NDArray[np.bool_]:
+def teaches(rows: Floats, names: Sequence[str]) -> Bools:
     """Return which rows (N, F) teach a model over some features: those of which it is asked.
 
     What is fitted is for the models of fits, and all others for the one without.

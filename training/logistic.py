@@ -6,13 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import expit
 
+from mushpipe.core.arrays import Floats
 from mushpipe.stages.verifier import COLUMNS
-
-Floats = NDArray[np.float64]
 
 
 def fit(

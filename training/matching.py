@@ -5,24 +5,23 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from mushpipe import Circles
+from mushpipe.core.arrays import Bools, Floats, Rows
 from mushpipe.core.truth import Truth
 from mushpipe.evaluate.matching import circle_iou
 
-Floats = NDArray[np.float64]
 IOU = 0.5
 
 
-def counted(truth: Truth, smallest: float, largest: float) -> NDArray[np.bool_]:
+def counted(truth: Truth, smallest: float, largest: float) -> Bools:
     """Return which caps must be found, for a detector of a range of radii (px)."""
     sized = (truth.radius >= smallest) & (truth.radius <= largest)
     return np.asarray((truth.ignore == 0) & sized)
 
 
-def matched(iou: Floats, counts: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def matched(iou: Floats, counts: Bools) -> tuple[Rows, Rows]:
     """Return the circles and the caps that go together, of a table of IoU (circles, caps).
 
     Args:
@@ -49,7 +48,7 @@ class Score:
     errors: list[tuple[float, float, float, float]] = field(default_factory=list)
     reliability: list[tuple[float, float]] = field(default_factory=list)
 
-    def add(self, circles: Circles, truth: Truth, counts: NDArray[np.bool_]) -> None:
+    def add(self, circles: Circles, truth: Truth, counts: Bools) -> None:
         """Match the circles of a frame with its truth."""
         iou = circle_iou(circles.center, circles.radius, truth.center, truth.radius)
         rows, columns = matched(iou, counts)

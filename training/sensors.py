@@ -7,11 +7,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mushpipe import RgbdFrame
-
-Singles = NDArray[np.float32]
+from mushpipe.core.arrays import Singles
 
 
 def worse(frame: RgbdFrame, rng: np.random.Generator) -> RgbdFrame:

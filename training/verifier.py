@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import expit, logit
 
 from mushpipe import Circles, Mask, RgbdFrame
+from mushpipe.core.arrays import Floats, Ints32, Singles
 from mushpipe.core.truth import Ignore
 from mushpipe.evaluate.matching import circle_iou
 from mushpipe.stages.cap_net import CapNet
@@ -27,7 +27,6 @@ from mushpipe.stages.chan_vese import ChanVese
 from mushpipe.stages.flatten import Flatten
 from mushpipe.stages.opening import Opening
 from mushpipe.stages.otsu import Otsu
-from mushpipe.stages.phase_edges import Rows
 from mushpipe.stages.phase_features import (
     DEPTH_FEATURES,
     IMAGE_FEATURES,
@@ -43,8 +42,6 @@ from training.matching import IOU
 from training.net.scenes import VERIFIER_SEED, varied_cases
 from training.scenes import Case, more_cases, training_cases
 
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
 Parts = dict[str, Floats]  # of a model, as in `verifier_net.Models`
 Trained = dict[str, tuple[Sequence[str], Parts]]  # the features of each model, and its parts
 RADII = (8.0, 45.0)
@@ -133,7 +130,7 @@ def doubtful(circles: Circles, rng: np.random.Generator) -> Circles:
     return Circles(circles.center[kept], circles.radius[kept], score[kept])
 
 
-def labels(case: Case, circles: Circles, order: Rows) -> Floats:
+def labels(case: Case, circles: Circles, order: Ints32) -> Floats:
     """Return 1 for right, 0 for wrong, NaN for candidates (N,) that teach nothing.
 
     The first of the accepted candidates (`order`) on a cap is right, all others on it are wrong;

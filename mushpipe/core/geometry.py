@@ -14,15 +14,15 @@ from functools import cache
 
 import numpy as np
 from numpy.polynomial import Polynomial
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from mushpipe.core.arrays import Floats
+
 COEFFICIENTS = {"none": 0, "brown_conrady": 5, "inverse_brown_conrady": 5, "rational": 8}
 _FORWARD = ("brown_conrady", "rational")
 _ROUNDS = 60  # of Gauss-Newton, at most
 
 
-def brown(xy: Array, coefficients: tuple[float, ...]) -> Array:
+def brown(xy: Floats, coefficients: tuple[float, ...]) -> Floats:
     """Apply the Brown-Conrady polynomial to normalised image coordinates.
 
     Args:
@@ -48,7 +48,7 @@ def brown(xy: Array, coefficients: tuple[float, ...]) -> Array:
     )
 
 
-def brown_inverse(xy: Array, coefficients: tuple[float, ...]) -> Array:
+def brown_inverse(xy: Floats, coefficients: tuple[float, ...]) -> Floats:
     """Undo `brown` by Gauss-Newton with a numeric Jacobian.
 
     Points where no pre-image is found to 1e-7 become NaN, and so do pre-images beyond the fold of
@@ -152,7 +152,7 @@ class Camera:
         """Whether the principal point lies within the image."""
         return 0 <= self.cx < self.width and 0 <= self.cy < self.height
 
-    def project(self, points: Array) -> Array:
+    def project(self, points: Floats) -> Floats:
         """Project (..., 3) points in metres to (..., 2) pixels.
 
         NaN behind the camera, and beyond the angle up to which the lens model holds.
@@ -167,7 +167,7 @@ class Camera:
             xy = brown_inverse(xy, self.coefficients)
         return np.asarray(xy * (self.fx, self.fy) + (self.cx, self.cy))
 
-    def deproject(self, pixels: Array, depth: Array) -> Array:
+    def deproject(self, pixels: Floats, depth: Floats) -> Floats:
         """Lift (..., 2) pixels at (...,) depths (z in metres) to (..., 3) points."""
         xy = (np.asarray(pixels, dtype=np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
         if self.model in _FORWARD:
@@ -178,7 +178,7 @@ class Camera:
         return np.concatenate([xy * z, z], axis=-1)
 
 
-def quaternion_from_axis(axis: Array) -> Array:
+def quaternion_from_axis(axis: Floats) -> Floats:
     """Return the shortest rotations that take +z to the given unit axes.
 
     Args:
@@ -197,12 +197,12 @@ def quaternion_from_axis(axis: Array) -> Array:
     return q / lengths(q)[:, None]
 
 
-def axis_from_quaternion(quaternion: Array) -> Array:
+def axis_from_quaternion(quaternion: Floats) -> Floats:
     """Return where unit quaternions (N, 4), x y z w, turn +z to: (N, 3); rows of NaN stay NaN."""
     x, y, z, w = quaternion.T
     return np.column_stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
 
 
-def lengths(vectors: Array) -> Array:
+def lengths(vectors: Floats) -> Floats:
     """Return the lengths (N,) of vectors (N, k), in half the time of `np.linalg.norm`."""
     return np.asarray(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)))

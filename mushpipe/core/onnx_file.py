@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Singles
 from mushpipe.core.errors import UsageError
 from mushpipe.core.libraries import import_onnxruntime
 
@@ -53,7 +54,7 @@ class OnnxFile:
         self._float = _FLOATS[kind]
         self.metadata: Mapping[str, str] = session.get_modelmeta().custom_metadata_map
 
-    def __call__(self, image: NDArray[np.float32], output: str) -> NDArray[Any]:
+    def __call__(self, image: Singles, output: str) -> NDArray[Any]:
         """Return one output for an image (1, C, H, W) as the only input.
 
         Raises:

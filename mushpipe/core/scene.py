@@ -8,8 +8,8 @@ from typing import Any
 
 import foxglove.messages as fox
 import numpy as np
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Bytes, Floats, Rows
 from mushpipe.core.tables import Circles, DepthSource, PickFlag, Picks
 from mushpipe.core.types import Header
 from mushpipe.core.wire import Message, foxglove_schema, timestamp
@@ -23,12 +23,12 @@ RED, AMBER, GREEN, CYAN = (255, 70, 70), (255, 190, 40), (60, 220, 90), (0, 200,
 SOURCE_COLORS = np.array([RED, GREEN, AMBER], np.uint8)  # by DepthSource
 
 
-def in_order(picks: Picks) -> NDArray[np.intp]:
+def in_order(picks: Picks) -> Rows:
     """Return the rows of the picks that have a position, in the order in which to pick."""
     return np.flatnonzero(picks.source != DepthSource.MISSING)
 
 
-def posed(picks: Picks, rows: NDArray[np.intp]) -> NDArray[np.intp]:
+def posed(picks: Picks, rows: Rows) -> Rows:
     """Return those of the rows that can be drawn as a cap: pose and diameter are known."""
     flagged = (picks.flags[rows] & PickFlag.POSE_UNKNOWN) != 0
     pose = np.column_stack([picks.axis[rows], picks.quaternion[rows], picks.diameter[rows]])
@@ -36,7 +36,7 @@ def posed(picks: Picks, rows: NDArray[np.intp]) -> NDArray[np.intp]:
     return np.asarray(rows[known & ~flagged])
 
 
-def tints(sigma: NDArray[np.float64]) -> NDArray[np.uint8]:
+def tints(sigma: Floats) -> Bytes:
     """Return (N, 3) colours: green is a certain tilt, red an uncertain one, grey an unknown one."""
     share = np.clip(np.nan_to_num(sigma), 0, FULL_SIGMA)[:, None] / FULL_SIGMA
     mixed = (1 - share) * np.array(GREEN) + share * np.array(RED)
@@ -67,7 +67,7 @@ def _color(rgb: tuple[int, int, int], alpha: float = 1.0) -> fox.Color:
     return fox.Color(r=r / 255, g=g / 255, b=b / 255, a=alpha)
 
 
-def _colors(table: NDArray[np.uint8], alpha: float = 1.0) -> list[fox.Color]:
+def _colors(table: Bytes, alpha: float = 1.0) -> list[fox.Color]:
     return [_color((r, g, b), alpha) for r, g, b in table.tolist()]
 
 
@@ -110,7 +110,7 @@ def scene_update(picks: Picks, header: Header) -> bytes:
     return fox.SceneUpdate(entities=[entity]).encode()
 
 
-def _spheres(picks: Picks, rows: NDArray[np.intp]) -> list[fox.SpherePrimitive]:
+def _spheres(picks: Picks, rows: Rows) -> list[fox.SpherePrimitive]:
     centers = picks.position[rows] - DOME / 2 * picks.diameter[rows, None] * picks.axis[rows]
     parts = zip(
         _poses(centers, picks.quaternion[rows]),
@@ -124,7 +124,7 @@ def _spheres(picks: Picks, rows: NDArray[np.intp]) -> list[fox.SpherePrimitive]:
     ]
 
 
-def _arrows(picks: Picks, rows: NDArray[np.intp]) -> list[fox.ArrowPrimitive]:
+def _arrows(picks: Picks, rows: Rows) -> list[fox.ArrowPrimitive]:
     from scipy.spatial.transform import Rotation
 
     if not len(rows):
@@ -150,7 +150,7 @@ def _arrows(picks: Picks, rows: NDArray[np.intp]) -> list[fox.ArrowPrimitive]:
     ]
 
 
-def _ranks(picks: Picks, rows: NDArray[np.intp]) -> list[fox.TextPrimitive]:
+def _ranks(picks: Picks, rows: Rows) -> list[fox.TextPrimitive]:
     upright = np.tile([0.0, 0.0, 0.0, 1.0], (len(rows), 1))
     return [
         fox.TextPrimitive(
@@ -165,7 +165,7 @@ def _ranks(picks: Picks, rows: NDArray[np.intp]) -> list[fox.TextPrimitive]:
     ]
 
 
-def _poses(positions: NDArray[np.float64], quaternions: NDArray[np.float64]) -> list[fox.Pose]:
+def _poses(positions: Floats, quaternions: Floats) -> list[fox.Pose]:
     return [
         fox.Pose(
             position=fox.Vector3(x=x, y=y, z=z),

@@ -14,11 +14,11 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Bools, Bytes, Floats, Ints
 from mushpipe.core.geometry import axis_from_quaternion
 
 AXIS_TOLERANCE = 1e-3
 _EXACTLY = "must be finite exactly where its source is not MISSING"
-Floats = NDArray[np.float64]
 
 
 def locked(array: Any, dtype: Any) -> NDArray[Any]:
@@ -119,7 +119,7 @@ class Columns:
     def __len__(self) -> int:
         return len(getattr(self, next(iter(self._columns()))))
 
-    def _require(self, condition: NDArray[np.bool_], text: str) -> None:
+    def _require(self, condition: Bools, text: str) -> None:
         """Raise ValueError with the first row of which a condition (N, ...) does not hold."""
         if not condition.all():
             row = np.argwhere(~condition)[0, 0]
@@ -146,12 +146,12 @@ class PickFlag(IntFlag):
     TOO_CLOSE_TO_NEIGHBOUR = 64  # less room around it than the gripper needs
 
 
-def _known(values: Floats) -> NDArray[np.bool_]:
+def _known(values: Floats) -> Bools:
     """Return which rows (N, k) are finite; `all` along an axis so short takes twice as long."""
     return reduce(np.logical_and, np.isfinite(values).T)
 
 
-def first_of(ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+def first_of(ids: Ints) -> Bools:
     """Return which rows (N,) have an id that no row before them has."""
     first = np.zeros(len(ids), np.bool_)
     first[np.unique(ids, return_index=True)[1]] = True
@@ -195,7 +195,7 @@ class Locations(Columns):
     position: Floats = column(3)
     distance: Floats = column()
     diameter: Floats = column()
-    source: NDArray[np.uint8] = column(dtype=np.uint8)
+    source: Bytes = column(dtype=np.uint8)
     sigma_position: Floats = column(3)
     sigma_diameter: Floats = column()
 
@@ -229,7 +229,7 @@ class Poses(Columns):
     apex: Floats = column(3)
     sigma_rad: Floats = column()
     fitness: Floats = column()
-    valid: NDArray[np.bool_] = column(dtype=np.bool_)
+    valid: Bools = column(dtype=np.bool_)
 
     def check(self) -> None:
         """Quaternion, axis and apex are known exactly where valid; both former have length 1.
@@ -271,7 +271,7 @@ class Picks(Columns):
         frame_id: The frame that positions, quaternions and axes are expressed in.
     """
 
-    id: NDArray[np.int64] = column(dtype=np.int64)
+    id: Ints = column(dtype=np.int64)
     center: Floats = column(2)
     radius: Floats = column()
     position: Floats = column(3)
@@ -284,7 +284,7 @@ class Picks(Columns):
     sigma_position: Floats = column(3)
     sigma_diameter: Floats = column()
     sigma_tilt: Floats = column()
-    source: NDArray[np.uint8] = column(dtype=np.uint8)
+    source: Bytes = column(dtype=np.uint8)
     flags: NDArray[np.uint32] = column(dtype=np.uint32)
     frame_id: str = ""
 

@@ -16,9 +16,9 @@ from pydantic import (
     field_validator,
 )
 
+from mushpipe.core.arrays import Floats
 from mushpipe.core.group import Group
 from mushpipe.core.paths import resolve_path
-from mushpipe.core.tables import Floats
 
 UNIT_TOLERANCE = 1e-3
 _EXPECTED = "frame, translation: [x, y, z] in m and quaternion: [x, y, z, w]"

@@ -11,17 +11,8 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.tables import (
-    Circles,
-    Columns,
-    Floats,
-    Locations,
-    Picks,
-    Poses,
-    column,
-    first_of,
-    locked,
-)
+from mushpipe.core.arrays import Bytes, Floats, Ints
+from mushpipe.core.tables import Circles, Columns, Locations, Picks, Poses, column, first_of, locked
 
 TRUTH_TOPIC = "/truth/mushrooms"
 INSTANCES_TOPIC = "/truth/instances"
@@ -57,7 +48,7 @@ class Truth(Columns):
         ignore: (N,) `Ignore`, 0 where the mushroom counts.
     """
 
-    id: NDArray[np.int64] = column(dtype=np.int64)
+    id: Ints = column(dtype=np.int64)
     center: Floats = column(2)
     radius: Floats = column()
     visible: Floats = column()
@@ -66,7 +57,7 @@ class Truth(Columns):
     axis: Floats = column(3)
     diameter: Floats = column()
     diameter_max: Floats = column()
-    ignore: NDArray[np.uint8] = column(dtype=np.uint8)
+    ignore: Bytes = column(dtype=np.uint8)
 
     def check(self) -> None:
         """Ids are unique, outlines known, fractions within 0..1, axes of length 1."""

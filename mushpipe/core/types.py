@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Bools, Bytes, Singles
 from mushpipe.core.geometry import Camera
 from mushpipe.core.tables import locked
 
@@ -82,7 +83,7 @@ class RgbdFrame:
     """
 
     header: Header
-    color: NDArray[np.uint8]
+    color: Bytes
     depth: NDArray[Any] | None = None
     depth_scale: float = 0.001
     camera: Camera | None = None
@@ -122,7 +123,7 @@ class RgbdFrame:
         object.__setattr__(self, "depth", depth)
 
     @cached_property
-    def gray(self) -> NDArray[np.float32]:
+    def gray(self) -> Singles:
         """(H, W) float32 luma (ITU-R BT.601) in 0..1, read-only."""
         import cv2
 
@@ -130,7 +131,7 @@ class RgbdFrame:
         return locked(luma * np.float32(1 / 255), np.float32)
 
     @cached_property
-    def depth_m(self) -> NDArray[np.float32]:
+    def depth_m(self) -> Singles:
         """(H, W) float32 depth in metres, NaN = missing (everywhere without depth), read-only.
 
         What no camera measures (100 km and more, the end of its scale) is missing as well.
@@ -157,8 +158,8 @@ class Mask:
         initial: (H, W) bool, the contour the segmenter started from; None where it had none.
     """
 
-    foreground: NDArray[np.bool_]
-    initial: NDArray[np.bool_] | None = None
+    foreground: Bools
+    initial: Bools | None = None
 
     def __post_init__(self) -> None:
         for name in ("foreground", "initial"):

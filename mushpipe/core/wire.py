@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import orjson
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Bytes
 from mushpipe.core.geometry import Camera
 from mushpipe.core.tables import Columns
 from mushpipe.core.truth import BUILT_IN, Instances, stands_for
@@ -126,7 +126,7 @@ def encode_color(frame: RgbdFrame, jpeg_quality: int | None = None) -> Message:
     return Message("", foxglove_schema("CompressedImage"), image.encode())
 
 
-def jpeg(color: NDArray[np.uint8], quality: int) -> bytes:
+def jpeg(color: Bytes, quality: int) -> bytes:
     """Return an (H, W, 3) RGB image as JPEG of a quality from 1 to 100."""
     import cv2
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import ValidationError
 
+from mushpipe.core.arrays import Floats
 from mushpipe.core.errors import InputError, UsageError
-from mushpipe.core.tables import Floats
 from mushpipe.evaluate.plane import PlaneRow
 from mushpipe.stages.depth_correct import DepthCorrect
 

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.tables import Columns, Floats, column
+from mushpipe.core.arrays import Bytes, Floats, Ints, Rows
+from mushpipe.core.tables import Columns, column
 from mushpipe.core.types import Header
 from mushpipe.evaluate.matching import Matching, match
 from mushpipe.evaluate.results import Detections
@@ -93,9 +94,9 @@ class Events(Columns):
         up: (N, 3) unit vector against gravity.
     """
 
-    unit: NDArray[np.int64] = column(dtype=np.int64)
-    member: NDArray[np.int64] = column(dtype=np.int64)
-    kind: NDArray[np.uint8] = column(dtype=np.uint8)
+    unit: Ints = column(dtype=np.int64)
+    member: Ints = column(dtype=np.int64)
+    kind: Bytes = column(dtype=np.uint8)
     true_center: Floats = column(2)
     true_radius: Floats = column()
     true_surface: Floats = column(3)
@@ -166,7 +167,7 @@ def _frame(unit: int, verdict: Verdict, up: Floats) -> dict[str, NDArray[Any]]:
     return part
 
 
-def _pick(values: NDArray[Any], rows: NDArray[np.intp]) -> Floats:
+def _pick(values: NDArray[Any], rows: Rows) -> Floats:
     """Return the rows of (N, ...) values; NaN for row -1."""
     padded = np.concatenate([values.astype(float), np.full((1, *values.shape[1:]), np.nan)])
     return np.asarray(padded[rows])

@@ -15,13 +15,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mushpipe.core.tables import Floats
+from mushpipe.core.arrays import Bools, Floats, Rows
 from mushpipe.evaluate.truth import FrameTruth
-
-Rows = NDArray[np.intp]
-Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +118,7 @@ def match(truth: FrameTruth, center: Floats, radius: Floats, threshold: float = 
     )
 
 
-def _inside(center: Floats, circles: Floats) -> Flags:
+def _inside(center: Floats, circles: Floats) -> Bools:
     """Return which of (M, 2) points lie in any of the (K, 3) circles ``u v radius``."""
     distance = np.linalg.norm(center[:, None] - circles[None, :, :2], axis=2)
     return np.asarray((distance <= circles[None, :, 2]).any(axis=1))

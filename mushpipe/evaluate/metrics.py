@@ -10,9 +10,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mushpipe.core.tables import Floats
+from mushpipe.core.arrays import Floats, Ints
 from mushpipe.evaluate import statistics
 from mushpipe.evaluate.events import Events, Kind
 from mushpipe.evaluate.statistics import Statistic
@@ -183,7 +182,7 @@ def measure(events: Events, frames: int, resamples: int = 1000, seed: int = 0) -
     }
 
 
-def _value(metric: Metric, x: Floats, drawn: Floats, rows: NDArray[np.int64]) -> Value:
+def _value(metric: Metric, x: Floats, drawn: Floats, rows: Ints) -> Value:
     n = int(np.isfinite(x).sum())
     value = statistics.evaluate(metric.statistic, x, np.ones((1, len(x))))[0]
     if not len(drawn) or not n:
@@ -192,7 +191,7 @@ def _value(metric: Metric, x: Floats, drawn: Floats, rows: NDArray[np.int64]) ->
     return Value(float(value), *statistics.interval(samples), n)
 
 
-def units_of(events: Events, frames: int) -> tuple[NDArray[np.int64], int]:
+def units_of(events: Events, frames: int) -> tuple[Ints, int]:
     """Return the (N,) unit that each event is resampled with, and how many units there are."""
     if frames != 1:
         return events.unit, frames

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.errors import EXIT_DIFFERS, EXIT_OK, InputError, UsageError
-from mushpipe.core.tables import Floats
 from mushpipe.evaluate import statistics
 from mushpipe.evaluate.metrics import Value
 from mushpipe.evaluate.thresholds import Outcome, check, parse_threshold, require_known
@@ -29,7 +28,7 @@ class PlaneRow:
     values: dict[str, Value]
 
 
-def window_of(depth_m: NDArray[np.float32]) -> Floats:
+def window_of(depth_m: Singles) -> Floats:
     """Return the central (WINDOW, WINDOW) window of a depth image, in mm; NaN = missing."""
     top, left = ((length - WINDOW) // 2 for length in depth_m.shape)
     if min(top, left) < 0:

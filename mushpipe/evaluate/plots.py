@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.tables import Floats
+from mushpipe.core.arrays import Floats, Rows
 from mushpipe.evaluate.events import Events, Kind
 from mushpipe.evaluate.metrics import angle_deg, quantities_of, stated_errors
 
@@ -103,7 +103,7 @@ def edges_of(x: Floats) -> Floats:
     return np.unique(np.quantile(x, np.linspace(0, 1, count + 1)))
 
 
-def bins_of(x: Floats, edges: Floats) -> NDArray[np.intp]:
+def bins_of(x: Floats, edges: Floats) -> Rows:
     """Return the bin (N,) of each value; what lies beyond the edges is in the outermost ones."""
     return np.clip(np.digitize(x, edges) - 1, 0, max(0, len(edges) - 2))
 

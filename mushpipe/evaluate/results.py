@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Bools, Floats
 from mushpipe.core.errors import InputError, UsageError, suggest
 from mushpipe.core.recording import MANIFEST, SUMMARY, Index, Raw, RecordingReader
-from mushpipe.core.tables import Circles, Columns, Floats, PickFlag, Picks, column
+from mushpipe.core.tables import Circles, Columns, PickFlag, Picks, column
 from mushpipe.core.types import Header
 from mushpipe.core.wire import TIMING_TOPIC, TOTAL, decode_table
 from mushpipe.traces import stage_times, stated
@@ -41,7 +41,7 @@ class Detections(Columns):
     center: Floats = column(2)
     radius: Floats = column()
     position: Floats = column(3)
-    apex: NDArray[np.bool_] = column(dtype=np.bool_)
+    apex: Bools = column(dtype=np.bool_)
     surface: Floats = column(3)
     diameter: Floats = column()
     axis: Floats = column(3)

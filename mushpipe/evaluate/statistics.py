@@ -11,9 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mushpipe.core.tables import Floats
+from mushpipe.core.arrays import Floats, Ints
 
 Statistic = Callable[[Floats, Floats], Floats]
 _CHUNK = 2_000_000
@@ -70,9 +69,7 @@ def dice(x: Floats, w: Floats) -> Floats:
         return np.asarray(2 * found / (found + rows))
 
 
-def evaluate(
-    statistic: Statistic, x: Floats, w: Floats, units: NDArray[np.int64] | None = None
-) -> Floats:
+def evaluate(statistic: Statistic, x: Floats, w: Floats, units: Ints | None = None) -> Floats:
     """Apply a statistic to the rows that are not NaN, in pieces that fit into memory.
 
     Args:

@@ -11,9 +11,9 @@ import numpy as np
 import orjson
 from pydantic import ValidationError
 
+from mushpipe.core.arrays import Floats
 from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.recording import RecordingReader
-from mushpipe.core.tables import Floats
 from mushpipe.core.truth import TRUTH_TOPIC, Truth
 from mushpipe.core.types import Header
 from mushpipe.core.wire import decode_table

@@ -12,9 +12,9 @@ from typing import Any, Literal
 
 import numpy as np
 import orjson
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from mushpipe.core.arrays import Bools, Floats, Rows
 from mushpipe.core.geometry import axis_from_quaternion
 from mushpipe.core.group import Group
 from mushpipe.core.tables import AXIS_TOLERANCE, DepthSource, PickFlag, Picks
@@ -22,8 +22,8 @@ from mushpipe.core.tables import AXIS_TOLERANCE, DepthSource, PickFlag, Picks
 Reason = Literal["no_depth", "estimated", "invalid", "workspace", "claimed", "limit"]
 REASONS: tuple[Reason, ...] = ("no_depth", "estimated", "invalid", "workspace", "claimed", "limit")
 Vector = tuple[float, float, float]
-Bools = NDArray[np.bool_]
-Floats = NDArray[np.float64]
+
+
 _FLAGS = tuple((int(flag), flag.name.lower()) for flag in PickFlag if flag.name)
 _SOURCES = {int(source): source.name.lower() for source in DepthSource}
 UNIT_TOLERANCE = 1e-3
@@ -96,7 +96,7 @@ class Filter:
             left, withheld = self._sieve(picks, oriented)
             return Choice(picks.frame_id, _targets(picks, oriented, left), withheld)
 
-    def _sieve(self, picks: Picks, oriented: Bools) -> tuple[NDArray[np.intp], dict[Reason, int]]:
+    def _sieve(self, picks: Picks, oriented: Bools) -> tuple[Rows, dict[Reason, int]]:
         bad: dict[Reason, Bools] = {
             "no_depth": _no_depth(picks),
             "estimated": _estimated(picks) & (not self._allow_estimated),
@@ -155,7 +155,7 @@ def _unit(rows: Floats) -> list[list[float]]:
     return units
 
 
-def _targets(picks: Picks, oriented: Bools, rows: NDArray[np.intp]) -> tuple[Target, ...]:
+def _targets(picks: Picks, oriented: Bools, rows: Rows) -> tuple[Target, ...]:
     """Encode rows; a micrometre and a millionth are finer than any camera."""
     position = np.round(picks.position, 6).tolist()
     quaternion, approach = _unit(picks.quaternion), _unit(-picks.axis)

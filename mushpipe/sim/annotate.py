@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from mushpipe.core.arrays import Floats, Ints
 from mushpipe.core.truth import Ignore, Instances, Truth
-from mushpipe.sim.mesh import Ints
 from mushpipe.sim.mushroom import Kind, Mushroom, turned_to
-from mushpipe.sim.noise import Floats
 from mushpipe.sim.raycast import rays
 from mushpipe.sim.render import Surface
 from mushpipe.sim.world import View, World

@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from mushpipe.core.arrays import Floats, Singles
 from mushpipe.sim.mesh import Material, Mesh, box, height_field, revolve, sheet
 from mushpipe.sim.mushroom import about_z
-from mushpipe.sim.noise import Floats, Reals, Singles, blurred, mix, smoothstep
+from mushpipe.sim.noise import Reals, blurred, mix, smoothstep
 from mushpipe.sim.planting import Area
 
 RIM_HEIGHT = 0.035

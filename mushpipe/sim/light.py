@@ -8,11 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Bools, Floats, Ints, Singles
 from mushpipe.sim.material import Paint
-from mushpipe.sim.mesh import Ints
-from mushpipe.sim.noise import Floats, Singles
 from mushpipe.sim.raycast import rays
 from mushpipe.sim.render import Surface, is_mushroom
 from mushpipe.sim.settings import SceneSettings
@@ -151,7 +149,7 @@ def lit(world: World, surface: Surface, paint: Paint, rig: Rig, sky: Singles) ->
 
 
 def _spot(
-    world: World, surface: Surface, paint: Paint, lamp: Lamp, spot: Floats, soft: NDArray[np.bool_]
+    world: World, surface: Surface, paint: Paint, lamp: Lamp, spot: Floats, soft: Bools
 ) -> tuple[Floats, Floats]:
     """Return diffuse and mirrored light (P,) of one spot of a lamp of power 1."""
     way = spot - surface.point

@@ -11,9 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mushpipe.sim.mesh import Ints, Material
+from mushpipe.core.arrays import Floats, Ints, Singles
+from mushpipe.sim.mesh import Material
 from mushpipe.sim.mushroom import Kind
-from mushpipe.sim.noise import Floats, Noise3, Singles, mix, smoothstep
+from mushpipe.sim.noise import Noise3, mix, smoothstep
 from mushpipe.sim.render import Surface, is_mushroom
 from mushpipe.sim.world import World
 

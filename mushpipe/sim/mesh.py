@@ -7,11 +7,9 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mushpipe.sim.noise import Floats, Reals
-
-Ints = NDArray[np.int64]
+from mushpipe.core.arrays import Floats, Ints
+from mushpipe.sim.noise import Reals
 
 
 class Material(IntEnum):

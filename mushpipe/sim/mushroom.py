@@ -7,8 +7,8 @@ from enum import IntEnum
 
 import numpy as np
 
+from mushpipe.core.arrays import Floats
 from mushpipe.sim.mesh import Material, Mesh, sheet
-from mushpipe.sim.noise import Floats
 from mushpipe.sim.shapes import CapShape, dome, margin, shaped, underside
 
 

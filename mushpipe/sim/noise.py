@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
+from mushpipe.core.arrays import Singles
+
 Reals = NDArray[np.floating[Any]]
 
 _PARTS = (

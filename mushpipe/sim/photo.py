@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from mushpipe.core.arrays import Bytes, Singles
 from mushpipe.core.group import Group
-from mushpipe.sim.noise import Singles
 
 
 class ColorCamera(Group):
@@ -36,7 +35,7 @@ class ColorCamera(Group):
             image = cv2.GaussianBlur(image, (0, 0), self.blur)
         return np.asarray(image)
 
-    def develop(self, image: Singles, rng: np.random.Generator) -> NDArray[np.uint8]:
+    def develop(self, image: Singles, rng: np.random.Generator) -> Bytes:
         """Return the picture (H, W, 3) uint8 RGB of exposed light, with this frame's noise.
 
         Shot and read noise in linear light, a curve that bends into white, the gamma of sRGB.
@@ -67,7 +66,7 @@ def _srgb(linear: Singles) -> Singles:
     return np.asarray(np.where(x < 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055))
 
 
-def _jpeg(codes: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
+def _jpeg(codes: Bytes, quality: int) -> Bytes:
     _, packed = cv2.imencode(".jpg", codes[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
     image = np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.uint8)
     return np.ascontiguousarray(image[..., ::-1])

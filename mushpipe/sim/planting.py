@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mushpipe.core.arrays import Floats
 from mushpipe.sim.mushroom import Kind, Mushroom
-from mushpipe.sim.noise import Floats, generator
+from mushpipe.sim.noise import generator
 from mushpipe.sim.settings import SceneSettings
 from mushpipe.sim.shapes import CapShape, Warp, deformed, draw_shape
 

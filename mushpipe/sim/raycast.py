@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Bools, Floats, Ints, Singles
 from mushpipe.core.libraries import import_open3d
-from mushpipe.sim.mesh import Ints
-from mushpipe.sim.noise import Floats, Reals, Singles
+from mushpipe.sim.noise import Reals
 
 
 class Raycaster:
@@ -55,7 +55,7 @@ class Raycaster:
         triangle = hit["primitive_ids"].numpy().astype(np.int64)
         return distance, np.where(np.isfinite(distance), triangle, -1), weights
 
-    def blocked(self, rays: Singles, far: float) -> NDArray[np.bool_]:
+    def blocked(self, rays: Singles, far: float) -> Bools:
         """Return (N,) whether anything stands on a ray before the distance `far`."""
         if not len(rays):
             return np.empty(0, np.bool_)

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mushpipe.sim.mesh import Ints, Material
-from mushpipe.sim.noise import Floats, Singles
+from mushpipe.core.arrays import Bools, Bytes, Floats, Ints, Singles
+from mushpipe.sim.mesh import Material
 from mushpipe.sim.raycast import rays
 from mushpipe.sim.world import View, World
 
@@ -38,9 +37,9 @@ class Surface:
     normal: Singles
     sight: Singles
     texture: Singles
-    material: NDArray[np.uint8]
+    material: Bytes
     owner: Ints
-    outlined: NDArray[np.bool_]
+    outlined: Bools
     triangle: Ints
     corners: Ints
     weights: Singles
@@ -91,6 +90,6 @@ def look(world: World, view: View, pixels: Floats | None = None) -> Surface:
     )
 
 
-def is_mushroom(material: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def is_mushroom(material: Bytes) -> Bools:
     """Return (P,) whether a surface is mushroom: cap, underside, stem or cut."""
     return np.asarray((material >= Material.CAP) & (material <= Material.CUT))

@@ -8,11 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Bools, Bytes, Singles
 from mushpipe.core.truth import Instances, Truth
 from mushpipe.sim.annotate import annotate
 from mushpipe.sim.light import ambient, lit, rig_for
 from mushpipe.sim.material import Paint, Painter
-from mushpipe.sim.noise import Singles, generator
+from mushpipe.sim.noise import generator
 from mushpipe.sim.photo import ColorCamera
 from mushpipe.sim.render import Surface, look
 from mushpipe.sim.sensor import DepthSensor, Exact
@@ -95,7 +96,7 @@ class Scene:
         light[rows] = total / len(_SUBPIXELS)
         return light.reshape(*surface.shape, 3)
 
-    def color(self, still: Still, frame: int) -> NDArray[np.uint8]:
+    def color(self, still: Still, frame: int) -> Bytes:
         """Return the colour image (H, W, 3) of a frame."""
         return self._color.develop(
             still.image, generator(self._settings.seed, "photo frame", frame)
@@ -106,7 +107,7 @@ class Scene:
         return self._depth.sense(still.exact, self._settings.seed, frame)
 
 
-def _edges(surface: Surface) -> NDArray[np.bool_]:
+def _edges(surface: Surface) -> Bools:
     """Return (P,) where a neighbour belongs to something else or is of another material."""
     kind = (surface.owner * 16 + surface.material).astype(np.float32).reshape(surface.shape)
     kernel = np.ones((3, 3), np.uint8)

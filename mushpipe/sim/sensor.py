@@ -20,9 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from mushpipe.core.arrays import Bools, Floats, Singles
 from mushpipe.core.group import Group
 from mushpipe.sim.material import Paint
-from mushpipe.sim.noise import Floats, Singles, blurred, generator
+from mushpipe.sim.noise import blurred, generator
 from mushpipe.sim.raycast import rays
 from mushpipe.sim.render import Surface
 from mushpipe.sim.world import View, World
@@ -34,8 +35,6 @@ EDGE = 0.006  # m between neighbouring pixels from which on a pixel counts as an
 WHITE, CORRELATED, FIXED_FINE, FIXED_WIDE = np.array([0.8, 0.35, 0.35, 0.3]) / np.sqrt(0.975)
 _GLOSSY = 0.15
 _MIRROR = 0.9985
-
-Bools = NDArray[np.bool_]
 
 
 def axial_sigma(depth: Singles) -> Singles:

@@ -12,8 +12,8 @@ from typing import Literal
 
 import numpy as np
 
+from mushpipe.core.arrays import Floats
 from mushpipe.sim.mesh import revolve
-from mushpipe.sim.noise import Floats
 
 Family = Literal["a", "b"]
 

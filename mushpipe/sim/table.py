@@ -7,10 +7,11 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
+from mushpipe.core.arrays import Floats, Singles
 from mushpipe.sim.ground import Ground, grid_shape
 from mushpipe.sim.mesh import Material, Mesh, box, revolve, sheet
 from mushpipe.sim.mushroom import about_z
-from mushpipe.sim.noise import Floats, Singles, blurred
+from mushpipe.sim.noise import blurred
 from mushpipe.sim.planting import Area
 
 _PAINTS = ((0.05, 0.16, 0.30), (0.07, 0.22, 0.12), (0.42, 0.42, 0.40), (0.30, 0.07, 0.06))

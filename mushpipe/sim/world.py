@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mushpipe import Camera
+from mushpipe.core.arrays import Bools, Bytes, Floats, Ints, Singles
 from mushpipe.sim import ground as grounds
 from mushpipe.sim import table as tables
 from mushpipe.sim.ground import Ground
-from mushpipe.sim.mesh import Ints, Material, Mesh, box, vertex_normals
+from mushpipe.sim.mesh import Material, Mesh, box, vertex_normals
 from mushpipe.sim.mushroom import Mushroom, build
-from mushpipe.sim.noise import Floats, Singles, generator
+from mushpipe.sim.noise import generator
 from mushpipe.sim.planting import Area, plant
 from mushpipe.sim.raycast import Raycaster
 from mushpipe.sim.settings import SceneSettings
@@ -43,9 +43,9 @@ class World:
     normals: Singles
     texture: Singles
     triangles: Ints
-    material: NDArray[np.uint8]
+    material: Bytes
     owner: Ints
-    outlined: NDArray[np.bool_]
+    outlined: Bools
     bodies: list[slice]
     caster: Raycaster
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe import Camera, Circles, Header, Mask, PickFlag, Picks, RgbdFrame, Trace
+from mushpipe.core.arrays import Bools, Bytes, Rows, Singles
 from mushpipe.core.scene import CORNER, DOME, SOURCE_COLORS, in_order, labels, posed, tints
 from mushpipe.core.transform import Transform
 from mushpipe.core.wire import jpeg
@@ -31,9 +32,9 @@ def results(trace: Trace, kind: type) -> Iterator[tuple[str, Any]]:
                 yield stage, value
 
 
-def masks(trace: Trace) -> dict[str, NDArray[np.bool_]]:
+def masks(trace: Trace) -> dict[str, Bools]:
     """Return masks by entity: each stage's, and each contour that one started from, once."""
-    layers: dict[str, NDArray[np.bool_]] = {}
+    layers: dict[str, Bools] = {}
     for stage, mask in results(trace, Mask):
         known = any(mask.initial is layer for layer in layers.values())
         if mask.initial is not None and not known:
@@ -124,7 +125,7 @@ def _log_cloud(rec: Any, frame: RgbdFrame, camera: Camera, step: int) -> None:
 
 
 @lru_cache(maxsize=4)
-def _rays(camera: Camera, step: int) -> NDArray[np.float32]:
+def _rays(camera: Camera, step: int) -> Singles:
     """Return the rays (N, 3) of every ``step``-th pixel each way; z is 1, or 0 without a ray."""
     from mushpipe.stages.upright import pixel_rays
 
@@ -155,7 +156,7 @@ def _log_series(rec: Any, entity: str, names: Sequence[str], values: Mapping[str
     rec.log(entity, rr.Scalars([values.get(name, np.nan) for name in names]))
 
 
-def _packed(colors: NDArray[np.uint8], alpha: int = 255) -> NDArray[np.uint32]:
+def _packed(colors: Bytes, alpha: int = 255) -> NDArray[np.uint32]:
     """Return colours (N, 3) as Rerun stores them, (N,)."""
     red, green, blue = colors.T.astype(np.uint32)
     return np.asarray(red << 24 | green << 16 | blue << 8 | np.uint32(alpha), np.uint32)
@@ -193,7 +194,7 @@ def _log_space(rec: Any, picks: Picks, place: str) -> None:
     _log_caps(rec, picks, posed(picks, located), place)
 
 
-def _log_caps(rec: Any, picks: Picks, rows: NDArray[np.intp], place: str) -> None:
+def _log_caps(rec: Any, picks: Picks, rows: Rows, place: str) -> None:
     import rerun as rr
 
     radius, axis, apex = picks.diameter[rows] / 2, picks.axis[rows], picks.position[rows]

@@ -15,6 +15,7 @@ import numpy as np
 from mcap.records import Schema
 from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Bytes
 from mushpipe.core.geometry import COEFFICIENTS, Camera
 from mushpipe.core.wire import DISTORTION_MODELS
 
@@ -45,7 +46,7 @@ _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _ROS1_NAME = re.compile(rb"^(float64\[\d*\] +)([DKRP])\b", re.MULTILINE)
 
 
-def _pixels(message: Any, item: int) -> NDArray[np.uint8]:
+def _pixels(message: Any, item: int) -> Bytes:
     """Return the image's bytes as (H, W * item), without the padding at the end of its rows."""
     height, width, step = message.height, message.width, message.step or message.width * item
     data = np.frombuffer(message.data, np.uint8)
@@ -57,7 +58,7 @@ def _pixels(message: Any, item: int) -> NDArray[np.uint8]:
     return data[: step * height].reshape(height, step)[:, : width * item]
 
 
-def decode_color(message: Any) -> NDArray[np.uint8]:
+def decode_color(message: Any) -> Bytes:
     """Decode a raw or compressed colour image to (H, W, 3) uint8 RGB.
 
     Raises:
@@ -82,7 +83,7 @@ def decode_color(message: Any) -> NDArray[np.uint8]:
     )
 
 
-def _decode_compressed_color(message: Any) -> NDArray[np.uint8]:
+def _decode_compressed_color(message: Any) -> Bytes:
     import cv2
 
     # Depth is not turned as a camera's EXIF may ask for colour.

@@ -14,6 +14,7 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Bytes, Floats, Ints, Singles
 from mushpipe.core.errors import InputError
 from mushpipe.core.geometry import Camera
 from mushpipe.core.libraries import import_realsense
@@ -55,9 +56,9 @@ class Clock(Columns):
             or the camera's clock translated to the host's by librealsense.
     """
 
-    number: NDArray[np.int64] = column(dtype=np.int64)
-    time_ms: NDArray[np.float64] = column()
-    domain: NDArray[np.uint8] = column(dtype=np.uint8)
+    number: Ints = column(dtype=np.int64)
+    time_ms: Floats = column()
+    domain: Bytes = column(dtype=np.uint8)
 
 
 def clock_of(frame: RgbdFrame) -> Clock | None:
@@ -190,7 +191,7 @@ class FrameMaker:
 
 def _along_color_axis(
     streams: dict[str, Any], camera: Camera, scale: float
-) -> tuple[NDArray[np.float32] | None, np.float32]:
+) -> tuple[Singles | None, np.float32]:
     """Return (H, W) gain and shift: (depth + shift) * gain is z of the colour camera, in units.
 
     No gain where the two cameras look the same way from the same distance.
@@ -230,7 +231,7 @@ def _clock(images: list[Any]) -> Clock:
     )
 
 
-def _color(frame: Any) -> NDArray[np.uint8]:
+def _color(frame: Any) -> Bytes:
     """Return a copy of a colour frame as (H, W, 3) RGB."""
     name = frame.get_profile().format().name
     encoding = _ENCODINGS.get(name)

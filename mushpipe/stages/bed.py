@@ -9,13 +9,11 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.linear import solve
 
-Floats = NDArray[np.float64]
-Plane = NDArray[np.float32]
 # Wide cells see the bed between dense caps, fine ones follow the soil.
 CELL, FINE_CELL = 32, 16  # px
 RELIEF_M = 0.02  # largest departure of the soil from the plane
@@ -29,7 +27,7 @@ WIDEST = 2.0  # misfit that a fit to a part of the image reaches for: caps, but 
 _REACH_CELLS = 2.5
 
 
-def bed_depth(depth_m: Plane, relief: bool = True) -> Plane | None:
+def bed_depth(depth_m: Singles, relief: bool = True) -> Singles | None:
     """Fit the bed and return its depth at every pixel.
 
     Args:
@@ -60,7 +58,7 @@ def bed_depth(depth_m: Plane, relief: bool = True) -> Plane | None:
 
 
 @jit
-def far_cells(depth: Plane, cell: int) -> Floats:
+def far_cells(depth: Singles, cell: int) -> Floats:
     """Return (H / cell, W / cell, 3): x, y (px) and depth of a far sample of each cell.
 
     Of 4 x 4 samples of a cell it is the 90th percentile, at its own place, since on a slope the

@@ -9,11 +9,11 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Floats, Ints32, Singles
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.cap_blocks import Cut, Image, Sensor, own_depth, room_to_cut
-from mushpipe.stages.cap_model import HEIGHT, ROOM, SIZE, Floats, Singles, Vector
+from mushpipe.stages.cap_model import HEIGHT, ROOM, SIZE, Vector
 from mushpipe.stages.cap_outline import LANES_ROOM, expected_reach, sample_outline
 from mushpipe.stages.cap_regrow import denials, regrow
 from mushpipe.stages.cap_samples import (
@@ -90,7 +90,7 @@ class Room(NamedTuple):
 
     work: Any
     cut: Cut
-    lanes: tuple[Singles, NDArray[np.int32]]
+    lanes: tuple[Singles, Ints32]
     rival: Fit
     other: Fit
     grown: Floats

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Bools, Floats, Ints
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.cap_attempt import (
     COUNTS,
@@ -34,7 +34,6 @@ from mushpipe.stages.cap_model import (
     ROOM,
     SIZE,
     UNKNOWNS,
-    Floats,
     N,
     Single,
     Vector,
@@ -80,7 +79,7 @@ class Fits:
         lean: (N,) rad, of the axis off the upright.
     """
 
-    valid: NDArray[np.bool_]
+    valid: Bools
     circle: Floats
     center: Floats
     axis: Floats
@@ -93,8 +92,8 @@ class Fits:
     sigma_radius: Floats
     sigma_surface: Floats
     fitness: Floats
-    edges: NDArray[np.int64]
-    lines: NDArray[np.int64]
+    edges: Ints
+    lines: Ints
     misfit: Floats
     lean: Floats
 
@@ -133,7 +132,7 @@ def second_fit(
 
 @jit
 def fit_all(
-    frame: Frame, circles: Floats, rank: NDArray[np.int64], upright: tuple[Vector, float],
+    frame: Frame, circles: Floats, rank: Ints, upright: tuple[Vector, float],
     settings: Settings, out: Any,
 ) -> None:  # fmt: skip
     """Fit every cap, first with the same prior for all, then with what they say of the scene.
@@ -228,7 +227,7 @@ def describe(fit: Fit, covariance: Floats, told: Floats) -> None:
 def fit_caps(
     frame: Frame,
     circles: Floats,
-    rank: NDArray[np.int64],
+    rank: Ints,
     upright: tuple[Floats, float],
     settings: Settings,
 ) -> Fits:

@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Floats, Ints32, Singles
 from mushpipe.core.jit import borrower, inlined, jit
-from mushpipe.stages.cap_model import Floats, Single, Singles
+from mushpipe.stages.cap_model import Single
 
 GRID = 11
 HIDDEN = Single(-1)
@@ -75,7 +76,7 @@ class Cut(NamedTuple):
     """
 
     own: Singles
-    pixels: NDArray[np.int32]
+    pixels: Ints32
     blocks: Singles
     values: Singles
 

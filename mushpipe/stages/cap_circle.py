@@ -9,10 +9,10 @@ rays along its outline held the cap, and the worse it fits.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Floats, Ints32, Singles
 from mushpipe.core.jit import borrower
-from mushpipe.stages.cap_model import Floats, Singles, Vector
+from mushpipe.stages.cap_model import Vector
 from mushpipe.stages.cap_outline import expected_reach
 from mushpipe.stages.cap_samples import COMPASS, DIRECTIONS
 
@@ -49,7 +49,7 @@ def improve(
     doubt: float,
     rays: Singles,
     focal: float,
-    room: tuple[Singles, NDArray[np.int32]],
+    room: tuple[Singles, Ints32],
 ) -> None:
     """Move a circle (3,) x, y, radius, px, towards the outline of its cap, in place.
 

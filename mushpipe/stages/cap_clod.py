@@ -10,15 +10,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mushpipe import Circles
+from mushpipe.core.arrays import Bools, Bytes, Floats
 from mushpipe.core.jit import borrower
 from mushpipe.core.tables import locked
 from mushpipe.stages.cap_kin import DARK, UNIT, Kin, distances, write_tone
 from mushpipe.stages.discs import discs_of
 
-Floats = NDArray[np.float64]
 ODD = 1.5  # distance to the nearer half of the sure caps from which on it is none of them
 ALIKE = 1.0  # distance to the ground up to which it looks like it
 LIKELY = 0.5  # score from which on a circle may be a cap, and so is no ground
@@ -32,7 +31,7 @@ CLOD_CHANCE = 0.05  # of what is one to be a cap; 1 of 68 was on another rendere
 NIGHT = 16.0  # gray levels; darker ground looks like everything
 
 
-def clods(color: NDArray[np.uint8], circles: Circles, kin: Kin) -> NDArray[np.bool_]:
+def clods(color: Bytes, circles: Circles, kin: Kin) -> Bools:
     """Return which circles (N,) look as the ground does and not as most sure caps do.
 
     Nothing is one where few circles are sure, and where no ground is seen or it is too dark to
@@ -50,10 +49,10 @@ def clods(color: NDArray[np.uint8], circles: Circles, kin: Kin) -> NDArray[np.bo
 
 
 def off_ground(
-    color: NDArray[np.uint8],
+    color: Bytes,
     circles: Circles,
     tones: Floats,
-    asked: NDArray[np.bool_],
+    asked: Bools,
     uneven: float = 0.0,
 ) -> Floats:
     """Return how far the tones of circles (N,) are from that of the ground around each.
@@ -77,7 +76,7 @@ def off_ground(
 
 @borrower
 def _grounds(
-    color: NDArray[np.uint8], discs: Floats, asked: NDArray[np.bool_], likely: NDArray[np.bool_],
+    color: Bytes, discs: Floats, asked: Bools, likely: Bools,
     ground: Floats,
 ) -> None:  # fmt: skip
     """Write tone and unevenness (N, 4) of the ground around the discs (N, 3) that are asked for."""
@@ -103,7 +102,7 @@ def _grounds(
 
 
 @borrower
-def _free(x: float, y: float, discs: Floats, likely: NDArray[np.bool_]) -> bool:
+def _free(x: float, y: float, discs: Floats, likely: Bools) -> bool:
     """Whether a point lies in none of the discs that may be caps, nor close to one."""
     for m in range(len(discs)):
         squared = (x - discs[m, 0]) ** 2 + (y - discs[m, 1]) ** 2

@@ -10,20 +10,18 @@ import math
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Bools, Floats, Rows, Singles
 from mushpipe.core.jit import borrower
 from mushpipe.stages.discs import iou
 
-Floats = NDArray[np.float64]
-Maps = NDArray[np.float32]
 STRIDE = 4
 HEAT, MASK, RADIUS, OFFSET = 0, 1, 2, slice(3, 5)
 CHANNELS = 5
 _MOST = 600  # peaks; more caps than that do not fit into an image
 
 
-def circles_of(maps: Maps, least: float) -> tuple[Floats, Floats]:
+def circles_of(maps: Singles, least: float) -> tuple[Floats, Floats]:
     """Return circles (N, 3) px and scores (N,), the most certain first.
 
     Args:
@@ -45,7 +43,7 @@ def circles_of(maps: Maps, least: float) -> tuple[Floats, Floats]:
     return circles, 1 / (1 + np.exp(-at[HEAT]))
 
 
-def first_of_each(circles: Floats, overlap: float) -> NDArray[np.intp]:
+def first_of_each(circles: Floats, overlap: float) -> Rows:
     """Return the rows of circles (N, 3) that overlap no kept row before by more than an IoU."""
     free = np.ones(len(circles), bool)
     _suppress(circles, overlap, free)
@@ -53,7 +51,7 @@ def first_of_each(circles: Floats, overlap: float) -> NDArray[np.intp]:
 
 
 @borrower
-def _suppress(circles: Floats, overlap: float, free: NDArray[np.bool_]) -> None:
+def _suppress(circles: Floats, overlap: float, free: Bools) -> None:
     for row in range(len(circles)):
         x, y, radius = circles[row]
         for before in range(row):

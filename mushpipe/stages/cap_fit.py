@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr
 
 from mushpipe import (
@@ -16,6 +15,7 @@ from mushpipe import (
     Stage,
     quaternion_from_axis,
 )
+from mushpipe.core.arrays import Bytes, Floats, Rows, Singles
 from mushpipe.core.geometry import lengths
 from mushpipe.stages.calibrated import calibration_of
 from mushpipe.stages.cap_attempt import Frame, Settings
@@ -32,7 +32,6 @@ from mushpipe.stages.surface_fit import fit_tops, sources, variance_along, witho
 from mushpipe.stages.upright import Up, pixel_rays, upright
 from mushpipe.stages.warm_up import example_circles, example_frame
 
-Floats = NDArray[np.float64]
 LEAST = 8  # points that a surface over a hole needs
 
 
@@ -131,8 +130,8 @@ class CapFit(Stage):
 
     def fit(
         self,
-        gray: NDArray[np.float32],
-        depth: NDArray[np.float32],
+        gray: Singles,
+        depth: Singles,
         camera: Camera,
         circles: Circles,
         order: Order | None = None,
@@ -175,9 +174,9 @@ class CapFit(Stage):
 
     def _bridge(
         self,
-        holes: NDArray[np.intp],
+        holes: Rows,
         fits: Fits,
-        depth: NDArray[np.float32],
+        depth: Singles,
         camera: Camera,
         circles: Circles,
         order: Order,
@@ -197,7 +196,7 @@ class CapFit(Stage):
         fits.sigma_surface[rows, 2] = np.maximum(fits.sigma_surface[rows, 2], np.sqrt(along))
 
 
-def _locations(fits: Fits, source: NDArray[np.uint8]) -> Locations:
+def _locations(fits: Fits, source: Bytes) -> Locations:
     return Locations(
         position=fits.surface,
         distance=lengths(fits.surface),

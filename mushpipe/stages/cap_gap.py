@@ -11,12 +11,12 @@ import logging
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mushpipe import Circles, RgbdFrame
+from mushpipe.core.arrays import Floats, Singles
 
 logger = logging.getLogger("mushpipe")
-Floats = NDArray[np.float64]
+
 # Edges: enough to judge by, from so many frames at most, and how far from what was stated they may
 # lie, px. At two, diameters are 1.5 mm off, and axes by 2 degrees more.
 ENOUGH, PATIENCE, AMISS, SHIFTED = 100, 60, 1.5, 2.0
@@ -125,9 +125,7 @@ def edge_gaps(frame: RgbdFrame, circles: Circles) -> Floats:
     return np.concatenate(found)
 
 
-def _gaps(
-    gray: NDArray[np.float32], depth: NDArray[np.float32], fx: float, center: Floats, radius: float
-) -> Floats:
+def _gaps(gray: Singles, depth: Singles, fx: float, center: Floats, radius: float) -> Floats:
     reach = min(_REACH, _SHARE * radius)
     away = np.arange(-reach, reach + 1e-6, _STEP)
     angle = np.arange(_DIRECTIONS)[:, None] * (2 * np.pi / _DIRECTIONS)

@@ -11,14 +11,13 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mushpipe import Circles
+from mushpipe.core.arrays import Bytes, Floats, Ints
 from mushpipe.core.jit import borrower, jit
 from mushpipe.core.tables import locked
 from mushpipe.stages.discs import discs_of
 
-Floats = NDArray[np.float64]
 SURE = 0.9  # score of what is surely a cap
 FEWEST = 6  # of them: fewer do not tell what is usual
 WITHIN = 0.6  # of the radius: what lies there is no rim and no neighbour
@@ -43,10 +42,10 @@ class Kin(NamedTuple):
     """
 
     tones: Floats
-    sure: NDArray[np.int64]
+    sure: Ints
 
 
-def kin_of(color: NDArray[np.uint8], circles: Circles) -> Kin:
+def kin_of(color: Bytes, circles: Circles) -> Kin:
     """Return what circles look like.
 
     Args:
@@ -59,7 +58,7 @@ def kin_of(color: NDArray[np.uint8], circles: Circles) -> Kin:
     return Kin(tones_of(color, circles), sure)
 
 
-def tones_of(color: NDArray[np.uint8], circles: Circles) -> Floats:
+def tones_of(color: Bytes, circles: Circles) -> Floats:
     """Return the tone (N, 3) of circles in an image (H, W, 3) RGB, in units as those of `Kin`."""
     tones = np.empty((len(circles), 3))
     # read-only as a frame's: to the compiler another type, and another kernel
@@ -79,7 +78,7 @@ def unlike(kin: Kin) -> Floats:
 
 
 @borrower
-def _tones(color: NDArray[np.uint8], discs: Floats, tones: Floats) -> None:
+def _tones(color: Bytes, discs: Floats, tones: Floats) -> None:
     height, width = color.shape[:2]
     for k in range(len(discs)):
         x, y, radius = discs[k, 0] + 0.5, discs[k, 1] + 0.5, discs[k, 2]
@@ -101,7 +100,7 @@ def write_tone(red: float, green: float, blue: float, tone: Floats) -> None:
 
 
 @jit
-def distances(tones: Floats, sure: NDArray[np.int64], nearest: int) -> Floats:
+def distances(tones: Floats, sure: Ints, nearest: int) -> Floats:
     """Return how far each (N,) is from the so many nearest of the sure ones, itself aside."""
     found, least = np.empty(len(tones)), np.empty(nearest)  # the squares so far, in order
     for k in range(len(tones)):

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.jit import borrower, inlined
-from mushpipe.stages.cap_model import ROOM, UNKNOWNS, Floats, Single, Singles, Vector
+from mushpipe.stages.cap_model import ROOM, UNKNOWNS, Single, Vector
 
 Six = tuple[float, float, float, float, float, float]
 

@@ -20,12 +20,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.jit import borrower, inlined
 
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
 Cap = tuple[float, ...]
 Single: Any = np.float32  # to type checkers a float
 Vector = tuple[float, float, float]

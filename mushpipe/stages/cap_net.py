@@ -8,24 +8,16 @@ from typing import Annotated, Self
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 
 from mushpipe import Circles, GraphPath, Header, Mask, RgbdFrame, Stage
+from mushpipe.core.arrays import Bools, Bytes, Floats, Singles
 from mushpipe.core.errors import UsageError
 from mushpipe.core.jit import borrower
 from mushpipe.core.onnx_file import OnnxFile
 from mushpipe.core.tables import locked
 from mushpipe.core.types import end_of_scale
-from mushpipe.stages.cap_decode import (
-    CHANNELS,
-    MASK,
-    STRIDE,
-    Floats,
-    Maps,
-    circles_of,
-    first_of_each,
-)
+from mushpipe.stages.cap_decode import CHANNELS, MASK, STRIDE, circles_of, first_of_each
 from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE, certain_first, discs_of
 from mushpipe.stages.letterbox import resized
 
@@ -135,7 +127,7 @@ class CapNet(Stage):
         every = certain_first(coarse.joined(fine.take(~within.any(axis=1))))
         return every.take(first_of_each(discs_of(every), self.overlap))
 
-    def _look(self, color: NDArray[np.uint8], scale: float, largest: float) -> tuple[Mask, Circles]:
+    def _look(self, color: Bytes, scale: float, largest: float) -> tuple[Mask, Circles]:
         """Return what is found in an image at a scale, up to a radius, px of the image."""
         height, width = color.shape[:2]
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
@@ -174,16 +166,14 @@ class CapNet(Stage):
             scale *= _STEP
         return scale, largest
 
-    def _within(
-        self, circles: Floats, width: int, height: int, largest: float
-    ) -> NDArray[np.bool_]:
+    def _within(self, circles: Floats, width: int, height: int, largest: float) -> Bools:
         """Return which circles (N, 3) are within the range, their centres within the image."""
         x, y, radius = circles.T
         inside = (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
         sized = (radius >= LEAST_OF_RANGE * self.radius_px[0]) & (radius <= MOST_OF_RANGE * largest)
         return np.asarray(inside & sized)
 
-    def _maps(self, color: NDArray[np.uint8]) -> Maps:
+    def _maps(self, color: Bytes) -> Singles:
         """Return the maps (5, h, w) of an image, padded to whole blocks."""
         net = self._load()
         bottom, right = (-n % _BLOCK for n in color.shape[:2])
@@ -228,7 +218,7 @@ def _depth_seen(frame: RgbdFrame) -> float | None:
 
 
 @borrower
-def _fill_planes(color: NDArray[np.uint8], planes: Maps) -> None:
+def _fill_planes(color: Bytes, planes: Singles) -> None:
     """Write the channels of an image (H, W, 3) into planes (3, H, W), 0..1."""
     unit = np.float32(1 / 255)
     for y in range(color.shape[0]):

@@ -5,16 +5,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Floats, Ints, Singles
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.cap_blocks import median
-from mushpipe.stages.cap_model import LANES, Floats, Singles
+from mushpipe.stages.cap_model import LANES
 
 WIDE = 32767.0  # columns, more than any image has
-Order = tuple[NDArray[np.int64], NDArray[np.int16]]
+Order = tuple[Ints, NDArray[np.int16]]
 
 
 @borrower
-def paint(ranks: NDArray[np.int16], circles: Floats, order: NDArray[np.int64]) -> None:
+def paint(ranks: NDArray[np.int16], circles: Floats, order: Ints) -> None:
     """Write into each pixel the rank of the nearest circle that covers it.
 
     Args:
@@ -72,7 +73,7 @@ def by_depth(depth: Singles, circles: Floats) -> Order:
 
 
 @jit
-def _rank(depth: Singles, circles: Floats, ranks: NDArray[np.int16]) -> NDArray[np.int64]:
+def _rank(depth: Singles, circles: Floats, ranks: NDArray[np.int16]) -> Ints:
     far, values = np.empty(len(circles)), np.empty(25, np.float32)
     for i in range(len(circles)):
         far[i] = core_depth(depth, circles[i], values)

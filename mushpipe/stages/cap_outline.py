@@ -8,8 +8,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Floats, Ints32, Singles
 from mushpipe.core.jit import borrower
-from mushpipe.stages.cap_model import RADIUS, Floats, Single, Singles, beside, frozen, meet, slope
+from mushpipe.stages.cap_model import RADIUS, Single, beside, frozen, meet, slope
 from mushpipe.stages.cap_samples import (
     COMPASS,
     DIRECTIONS,
@@ -33,7 +34,7 @@ LEAST_STEP = 0.04  # of luma, between 1 px inside and 1 px outside
 X, Y, DX, DY, FX, FY, CORNERS = (k * DIRECTIONS for k in range(1, 8))
 BEST, PLACE, LINES = X, Y, CORNERS + 4 * DIRECTIONS
 LANES_ROOM = LINES + (2 * REACH + 1) * DIRECTIONS
-Lanes = tuple[Singles, NDArray[np.int32]]  # (LANES_ROOM,) and (2 DIRECTIONS,)
+Lanes = tuple[Singles, Ints32]  # (LANES_ROOM,) and (2 DIRECTIONS,)
 
 
 @borrower
@@ -43,7 +44,7 @@ def expected_reach(
     focal: float,
     circle: Floats,
     row: Singles,
-    pixels: NDArray[np.int32],
+    pixels: Ints32,
 ) -> None:
     """Fill how far (DIRECTIONS,), px, the outline of a cap lies from the centre of a circle.
 
@@ -91,7 +92,7 @@ def expected_reach(
 @borrower
 def place_lines(
     ranks: NDArray[np.int16], rank: int, circle: Floats, half: int, row: Singles,
-    pixels: NDArray[np.int32],
+    pixels: Ints32,
 ) -> None:  # fmt: skip
     """Place a line across the outline in each direction, if the image and the cap show it there.
 
@@ -129,7 +130,7 @@ def place_lines(
 
 
 @borrower
-def look_along(gray: Singles, count: int, row: Singles, pixels: NDArray[np.int32]) -> float:
+def look_along(gray: Singles, count: int, row: Singles, pixels: Ints32) -> float:
     """Fill the luma along the lines, bilinear; return how much it falls along all of them.
 
     Args:

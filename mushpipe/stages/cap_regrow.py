@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.cap_blocks import Image
 from mushpipe.stages.cap_linear import tukey
-from mushpipe.stages.cap_model import HEIGHT, RADIUS, Floats, N, Singles
+from mushpipe.stages.cap_model import HEIGHT, RADIUS, N
 from mushpipe.stages.cap_samples import COMPASS, DIRECTIONS
 from mushpipe.stages.linear import solve
 

@@ -7,8 +7,8 @@ numbers.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Floats, Ints32, Singles
 from mushpipe.core.jit import borrower
 from mushpipe.stages.cap_blocks import (
     CELLS,
@@ -27,7 +27,7 @@ from mushpipe.stages.cap_blocks import (
     half_width,
     middle_depth,
 )
-from mushpipe.stages.cap_model import Floats, Single, Singles, Vector
+from mushpipe.stages.cap_model import Single, Vector
 
 DIRECTIONS = 32
 RADII = 26
@@ -103,7 +103,7 @@ def sample_depth(
 
 
 @borrower
-def _taken(pixels: NDArray[np.int32], cell: int) -> bool:
+def _taken(pixels: Ints32, cell: int) -> bool:
     """Return whether the pixel of a cell is that of a cell before it."""
     taken = False
     for k in range(cell):
@@ -114,7 +114,7 @@ def _taken(pixels: NDArray[np.int32], cell: int) -> bool:
 @borrower
 def look_around(
     window: Window, own: Singles, at: tuple[float, float], far: float, state: Singles,
-    pixels: NDArray[np.int32],
+    pixels: Ints32,
 ) -> None:  # fmt: skip
     """Put the depth in each direction into the last row of `state`, 0 outside of the window.
 
@@ -143,7 +143,7 @@ def follow(
     circle: Floats,
     gate: tuple[float, float],
     state: Singles,
-    pixels: NDArray[np.int32],
+    pixels: Ints32,
 ) -> None:
     """Find the last step of a cap in each direction, where its edge is to be trusted.
 
@@ -203,7 +203,7 @@ def sample_edges(
     focal: float,
     middle: float,
     offset: float,
-    room: tuple[Singles, NDArray[np.int32]],
+    room: tuple[Singles, Ints32],
     out: Singles,
 ) -> int:
     """Find the depth edge of a cap in 32 directions.

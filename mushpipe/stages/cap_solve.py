@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.cap_linear import (
     cholesky,
@@ -23,10 +24,8 @@ from mushpipe.stages.cap_model import (
     RADIUS,
     ROOM,
     UNKNOWNS,
-    Floats,
     N,
     Single,
-    Singles,
     Vector,
     fill_rows,
     move,

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.cap_linear import solve3
-from mushpipe.stages.cap_model import BULGE, HEIGHT, RADIUS, Floats, N, Singles, Vector, span
+from mushpipe.stages.cap_model import BULGE, HEIGHT, RADIUS, N, Vector, span
 
 ASPECT = 0.62
 USUAL, CONICAL = (ASPECT, 0.0), (0.85, -0.1)  # aspect and bulge that a fit may start with

@@ -11,13 +11,12 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mushpipe import Circles
+from mushpipe.core.arrays import Bools, Floats
 from mushpipe.stages.cap_batch import Fits
 from mushpipe.stages.verifier import package_file, probability, read_models
 
-Floats = NDArray[np.float64]
 FILE = "fitted.yaml"
 ROUND = 0.6  # height over radius; a rounder cap is no more, and no less, likely one
 # Flatter than any cap in the training scenes: lids, cups upside down, paper and cut stumps. It is a
@@ -60,7 +59,7 @@ def _of_fits(circles: Circles, fits: Fits) -> Floats:
     )
 
 
-def flat(fits: Fits) -> NDArray[np.bool_]:
+def flat(fits: Fits) -> Bools:
     """Return which fits (N,) are flatter than a cap; False where nothing was fitted."""
     return np.asarray(fits.valid & (fits.height < FLAT * fits.radius))
 

@@ -5,17 +5,15 @@ from __future__ import annotations
 from typing import Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from mushpipe import Mask, RgbdFrame, Stage
+from mushpipe.core.arrays import Bools, Singles
 from mushpipe.stages.channels import MANY, Channel, channel_image, inverted
 from mushpipe.stages.otsu import initial_contour
 from mushpipe.stages.polarity import rise
 from mushpipe.stages.warm_up import example_frame
 
-Plane = NDArray[np.float32]
-Region = NDArray[np.bool_]
 SUNKEN_M = 0.003  # a bright side that lies this much lower is the bed
 
 
@@ -71,7 +69,7 @@ class ChanVese(Stage):
             image = np.maximum(image, np.float32(found.floor))
         return Mask(self.solve(image, initial), initial)
 
-    def solve(self, image: Plane, initial: Region) -> Region:
+    def solve(self, image: Singles, initial: Bools) -> Bools:
         """Evolve a region of an image in 0..1 with the chosen solver."""
         if self.solver == "fast":
             from mushpipe.stages.chan_vese_fast import solve_fast
@@ -83,13 +81,13 @@ class ChanVese(Stage):
             return solve_morphological(image, initial, self.iterations, self.smoothing)
         return self._solve_pde(image, initial)
 
-    def _solve_pde(self, image: Plane, initial: Region) -> Region:
+    def _solve_pde(self, image: Singles, initial: Bools) -> Bools:
         from scipy.ndimage import distance_transform_edt
         from skimage.segmentation import chan_vese
 
         # Signed distance, clipped: the solver's delta function reaches a few pixels only.
         start = distance_transform_edt(initial) - distance_transform_edt(~initial)
-        region: Region = chan_vese(
+        region: Bools = chan_vese(
             image,
             mu=self.mu,
             lambda1=1,

@@ -11,13 +11,11 @@ a direction. With several channels the squared differences are averaged over the
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Image = NDArray[np.float32]
-Region = NDArray[np.bool_]
+from mushpipe.core.arrays import Bools, Floats, Singles
 
 
-def region_means(image: Image, region: Region) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def region_means(image: Singles, region: Bools) -> tuple[Floats, Floats]:
     """Return the means (C,) inside and outside of a region; 0 for an empty side."""
     planes = image.reshape(-1, image.shape[-1]) if image.ndim == 3 else image.reshape(-1, 1)
     flat = region.ravel()
@@ -28,7 +26,7 @@ def region_means(image: Image, region: Region) -> tuple[NDArray[np.float64], NDA
     return sum_inside / max(1, inside), (total - sum_inside) / outside
 
 
-def contour_length(region: Region) -> float:
+def contour_length(region: Bools) -> float:
     """Return the Cauchy-Crofton length of a region's contour in pixels."""
     u = region
     axial = np.count_nonzero(u[1:] != u[:-1]) + np.count_nonzero(u[:, 1:] != u[:, :-1])
@@ -37,7 +35,7 @@ def contour_length(region: Region) -> float:
     return float(np.pi / 8 * (axial + diagonal / np.sqrt(2)))
 
 
-def chan_vese_energy(image: Image, region: Region, mu: float) -> float:
+def chan_vese_energy(image: Singles, region: Bools, mu: float) -> float:
     """Return E of a region of an (H, W) or (H, W, C) image in 0..1."""
     planes = image[..., None] if image.ndim == 2 else image
     c1, c2 = region_means(image, region)

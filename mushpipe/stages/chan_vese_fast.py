@@ -7,6 +7,8 @@ sqrt(2 pi) / sigma * sum u (1 - G_sigma * u); linearised, an iteration is a blur
 
 The sweeps that follow, on every level, descend the exact discrete energy pixel by pixel (ICM, Besag
 1986), which convolution with its finite kernel cannot reach.
+
+Regions are bytes, 1 inside, 0 outside: a quarter of the memory that floats would need.
 """
 
 from __future__ import annotations
@@ -16,15 +18,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Bools, Bytes, Floats, Singles
 from mushpipe.core.jit import inlined, jit
 from mushpipe.stages.doubling import doubled
 
-Floats = NDArray[np.float64]
-Plane = NDArray[np.float32]
-Planes = NDArray[np.float32]
-Bits = NDArray[np.uint8]  # 1 inside, 0 outside; a quarter of the memory that floats would need
 Levels = tuple[float, float]
 SIGMA = 1.5
 DEPTH = 5  # levels of the pyramid, the full resolution among them
@@ -37,7 +35,7 @@ _TAPS /= _TAPS.sum()
 
 @jit
 def ictm_sweep(
-    image: Plane, old: Bits, new: Bits, taps: Plane, gain: float, offset: float, pull: float
+    image: Singles, old: Bytes, new: Bytes, taps: Singles, gain: float, offset: float, pull: float
 ) -> int:
     """One iteration: new = 1 where gain I + offset + pull (2 G*old - 1) > 0, borders replicated.
 
@@ -77,7 +75,7 @@ def ictm_sweep(
 
 
 @jit
-def region_sums(image: Plane, u: Bits) -> tuple[int, float, float]:
+def region_sums(image: Singles, u: Bytes) -> tuple[int, float, float]:
     """Return the number of pixels inside, the image's sum over them, and its sum over all."""
     height, width = image.shape
     inside = 0
@@ -98,7 +96,7 @@ def region_sums(image: Plane, u: Bits) -> tuple[int, float, float]:
 
 
 @jit
-def icm_sweep(image: Plane, u: Bits, gain: float, offset: float, mu: float) -> int:
+def icm_sweep(image: Singles, u: Bytes, gain: float, offset: float, mu: float) -> int:
     """Flip, in raster order and in place, each pixel that lowers the energy by it.
 
     With s = 1 outside, -1 inside and 0 beyond the border, a flip lowers the energy by
@@ -136,7 +134,7 @@ def icm_sweep(image: Plane, u: Bits, gain: float, offset: float, mu: float) -> i
 
 
 @jit
-def _signs(u: Bits, y: int, row: Plane) -> None:
+def _signs(u: Bytes, y: int, row: Singles) -> None:
     """Write the signs of a row, 1 px to the right."""
     height, width = u.shape
     for x in range(width):
@@ -144,13 +142,15 @@ def _signs(u: Bits, y: int, row: Plane) -> None:
 
 
 @inlined
-def _pull(above: Plane, here: Plane, below: Plane, x: int, a: np.float32, b: np.float32) -> Any:
+def _pull(
+    above: Singles, here: Singles, below: Singles, x: int, a: np.float32, b: np.float32
+) -> Any:
     axial = above[x + 1] + below[x + 1] + here[x] + here[x + 2]
     return a * axial + b * (above[x] + above[x + 2] + below[x] + below[x + 2])
 
 
 @jit
-def _means(planes: Planes, u: Bits, c1: Floats, c2: Floats, known: bool) -> int:
+def _means(planes: Singles, u: Bytes, c1: Floats, c2: Floats, known: bool) -> int:
     """Write the means of the two sides, unless they are known; return the pixels inside."""
     inside = 0
     for k in range(len(planes)):
@@ -162,7 +162,7 @@ def _means(planes: Planes, u: Bits, c1: Floats, c2: Floats, known: bool) -> int:
 
 
 @jit
-def _force(planes: Planes, c1: Floats, c2: Floats, mixed: Plane) -> tuple[Plane, float, float]:
+def _force(planes: Singles, c1: Floats, c2: Floats, mixed: Singles) -> tuple[Singles, float, float]:
     """Return P, gain and offset of |I - c2|^2 - |I - c1|^2 = gain P + offset; mixed is scratch."""
     count = len(planes)
     gain, offset = 2 * (c1 - c2) / count, ((c2 * c2).sum() - (c1 * c1).sum()) / count
@@ -176,8 +176,8 @@ def _force(planes: Planes, c1: Floats, c2: Floats, mixed: Plane) -> tuple[Plane,
 
 @jit
 def _solve_level(
-    planes: Planes, u: Bits, mu: float, c1: Floats, c2: Floats, known: bool, most: tuple[int, int]
-) -> Bits:
+    planes: Singles, u: Bytes, mu: float, c1: Floats, c2: Floats, known: bool, most: tuple[int, int]
+) -> Bytes:
     """Run at most so many ICTM iterations and sweeps of descent on a region, which is changed.
 
     One kernel, since each return to Python may have to wait for other threads.
@@ -205,11 +205,11 @@ def _solve_level(
 
 
 def solve_fast(
-    image: Plane,
-    initial: NDArray[np.bool_],
+    image: Singles,
+    initial: Bools,
     mu: float,
     levels: Levels | None = None,
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Minimise the Chan-Vese energy from an initial region.
 
     Args:
@@ -225,14 +225,14 @@ def solve_fast(
 
 
 def _pyramid(
-    planes: Planes,
-    initial: Bits,
+    planes: Singles,
+    initial: Bytes,
     mu: float,
     levels: Levels | None,
     depth: int,
     iterations: int,
     sweeps: int,
-) -> Bits:
+) -> Bytes:
     """Solve at half resolution first, with mu / 2: the length halves while the area quarters."""
     height, width = initial.shape
     if depth > 1 and min(height, width) >= 32:

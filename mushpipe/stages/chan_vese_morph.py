@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Bools, Singles
 from mushpipe.core.jit import jit
 from mushpipe.stages.chan_vese_fast import region_sums
 
 Words = NDArray[np.uint64]
-Plane = NDArray[np.float32]
 
 
-def pack(mask: NDArray[np.bool_]) -> Words:
+def pack(mask: Bools) -> Words:
     """Pack an (H, W) mask into (H, ceil(W / 64)) words, the leftmost pixel in the lowest bit."""
     height, width = mask.shape
     padded = mask.view(np.uint8)
@@ -30,7 +30,7 @@ def pack(mask: NDArray[np.bool_]) -> Words:
     return np.packbits(padded, axis=1, bitorder="little").view(np.uint64)
 
 
-def unpack(words: Words, width: int) -> NDArray[np.bool_]:
+def unpack(words: Words, width: int) -> Bools:
     """Undo `pack`."""
     bits = np.unpackbits(words.view(np.uint8), axis=1, bitorder="little")
     return np.ascontiguousarray(bits[:, :width]).view(np.bool_)
@@ -92,7 +92,7 @@ def attachment_step(words: Words, inside: Words, out: Words, width: int) -> None
 
 
 @jit
-def change_of_region(image: Plane, old: Words, new: Words) -> tuple[int, float]:
+def change_of_region(image: Singles, old: Words, new: Words) -> tuple[int, float]:
     """Return by how much the number of set pixels and the image's sum over them grew."""
     width = image.shape[1]
     count = 0
@@ -115,9 +115,7 @@ def change_of_region(image: Plane, old: Words, new: Words) -> tuple[int, float]:
     return count, total
 
 
-def solve_morphological(
-    image: Plane, initial: NDArray[np.bool_], iterations: int, smoothing: int
-) -> NDArray[np.bool_]:
+def solve_morphological(image: Singles, initial: Bools, iterations: int, smoothing: int) -> Bools:
     """Evolve a region through so many iterations.
 
     The operators alternate, so a region at rest swings between a few states: from the first that

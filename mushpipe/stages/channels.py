@@ -6,18 +6,16 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mushpipe import RgbdFrame
+from mushpipe.core.arrays import Bools, Singles
 from mushpipe.stages.evidence import BELIEVED, believed_foreground, halved
 
 Channel = Literal["gray", "rgb", "a", "red-blue", "auto", "gray+height"]
 MANY = ("rgb", "gray+height")  # channels of more than one plane
-Plane = NDArray[np.float32]
-Region = NDArray[np.bool_]
 
 
-def channel_image(frame: RgbdFrame, channel: Channel) -> Plane:
+def channel_image(frame: RgbdFrame, channel: Channel) -> Singles:
     """Return an (H, W) float32 image in 0..1; (H, W, 3) for ``rgb``, (H, W, 2) for gray+height.
 
     ``a`` is the green-to-red axis of CIE Lab and ``red-blue`` the difference of both channels,
@@ -36,7 +34,7 @@ def channel_image(frame: RgbdFrame, channel: Channel) -> Plane:
     return _stretched(cv2.GaussianBlur(frame.color, (5, 5), 1.0), channel)
 
 
-def inverted(image: Plane, channel: Channel) -> Plane:
+def inverted(image: Singles, channel: Channel) -> Singles:
     """Return an image of a channel with dark caps bright; height stays as it is."""
     result = 1 - image
     if channel == "gray+height" and image.ndim == 3:
@@ -44,7 +42,7 @@ def inverted(image: Plane, channel: Channel) -> Plane:
     return result
 
 
-def _stretched(color: Any, channel: str) -> Plane:
+def _stretched(color: Any, channel: str) -> Singles:
     """Return the channel ``a`` or ``red-blue`` of a blurred image, (H, W) from 0 to 1."""
     if channel == "a":
         plane = cv2.extractChannel(cv2.cvtColor(color, cv2.COLOR_RGB2LAB), 1).astype(np.float32)
@@ -54,7 +52,7 @@ def _stretched(color: Any, channel: str) -> Plane:
     return np.asarray((plane - low) / max(high - low, 1e-6), np.float32)
 
 
-def _with_height(frame: RgbdFrame) -> Plane:
+def _with_height(frame: RgbdFrame) -> Singles:
     from mushpipe.stages.height import height_image, height_map
 
     gray = channel_image(frame, "gray")
@@ -62,7 +60,7 @@ def _with_height(frame: RgbdFrame) -> Plane:
     return gray if height is None else np.dstack([gray, height_image(height, 0.008, 0.15)])
 
 
-def best_image(frame: RgbdFrame) -> Plane:
+def best_image(frame: RgbdFrame) -> Singles:
     """Return gray, a colour channel, or their joint membership, whichever the evidence speaks for.
 
     A colour channel counts where its own split is clearly believed and agrees with that of gray:
@@ -91,13 +89,13 @@ def best_image(frame: RgbdFrame) -> Plane:
     return np.maximum(_membership(gray, bright), _membership(image, whole.view(np.bool_)))
 
 
-def _agrees(region: Region, bright: Region) -> float:
+def _agrees(region: Bools, bright: Bools) -> float:
     """Return the share of the bright region that a region holds; 1 where nothing is bright."""
     count = int(np.count_nonzero(bright))
     return float(np.count_nonzero(region & bright) / count) if count else 1.0
 
 
-def _membership(image: Plane, region: Region) -> Plane:
+def _membership(image: Singles, region: Bools) -> Singles:
     """Return how much a pixel belongs to a region, 0.5 midway between the means of the sides."""
     c1, c2 = float(image[region].mean()), float(image[~region].mean())
     return np.asarray(np.clip((image - c2) / (c1 - c2), 0, 1), np.float32)

@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 
 from mushpipe import GraphPath, InputError, RgbdFrame, Stage
+from mushpipe.core.arrays import Singles
 from mushpipe.core.document import read_document
 from mushpipe.core.errors import GraphError
 from mushpipe.core.jit import jit
 from mushpipe.core.types import end_of_scale
 from mushpipe.stages.warm_up import example_frame
-
-Plane = NDArray[np.float32]
 
 
 class DepthCorrect(Stage):
@@ -78,9 +77,7 @@ class DepthCorrect(Stage):
 
 
 @jit
-def corrected(
-    depth: NDArray[Any], scale: float, errors: NDArray[np.float32], end: np.float32
-) -> Plane:
+def corrected(depth: NDArray[Any], scale: float, errors: Singles, end: np.float32) -> Singles:
     """Take a polynomial with coefficients from the constant on (m) off depth in units of scale (m).
 
     What is missing, from the end of the scale on, or not above 0 afterwards, is 0.

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Floats
 from mushpipe.core.geometry import Camera
 from mushpipe.core.jit import borrower
 from mushpipe.core.tables import Circles
@@ -15,7 +15,7 @@ from mushpipe.core.tables import Circles
 LEAST_OF_RANGE, MOST_OF_RANGE = 0.9, 1.1
 
 
-def discs_of(circles: Circles) -> NDArray[np.float64]:
+def discs_of(circles: Circles) -> Floats:
     """Return x, y and radius (N, 3), px."""
     return np.column_stack([circles.center, circles.radius])
 
@@ -25,7 +25,7 @@ def certain_first(circles: Circles) -> Circles:
     return circles.take(np.argsort(-circles.score, kind="stable"))
 
 
-def radii_on_rays(circles: Circles, camera: Camera) -> NDArray[np.float64]:
+def radii_on_rays(circles: Circles, camera: Camera) -> Floats:
     """Return the radii (N,) of circles on the plane z = 1, NaN where the lens has no rays.
 
     From the area that two diameters span there: a lens may show a pixel larger or smaller at the

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Bytes
 from mushpipe.core.jit import jit
-
-Bits = NDArray[np.uint8]
 
 
 @jit
-def doubled(small: Bits, height: int, width: int) -> Bits:
+def doubled(small: Bytes, height: int, width: int) -> Bytes:
     """Return an image at full size, (height, width).
 
     Args:

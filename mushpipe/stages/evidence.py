@@ -21,11 +21,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Bools, Bytes, Floats, Singles
 from mushpipe.core.jit import jit
 
-Plane = NDArray[np.float32]
-Bits = NDArray[np.uint8]
-Region = NDArray[np.bool_]
 # A Gaussian split in the middle has D = 2.7, a uniform distribution 3.5, both in scattered pieces.
 BELIEVED = 2.6
 # Beds of the simulator and real ones step by 0.45 and more, ramps and wood by less than 0.3.
@@ -44,12 +42,12 @@ class Evidence(NamedTuple):
             off, 0 for the first split. An image cut off there has the split as its only one.
     """
 
-    region: Region
+    region: Bools
     strength: float
     floor: float
 
 
-def believed_foreground(image: Plane, half: bool = False) -> Evidence:
+def believed_foreground(image: Singles, half: bool = False) -> Evidence:
     """Return the first believed split of an (H, W) image in 0..1.
 
     Args:
@@ -69,13 +67,13 @@ def believed_foreground(image: Plane, half: bool = False) -> Evidence:
     return Evidence(np.zeros(image.shape, bool), 0.0, 0.0)
 
 
-def _mean(histogram: NDArray[np.float64], first: int, last: int) -> float:
+def _mean(histogram: Floats, first: int, last: int) -> float:
     """Return the mean of the levels from first to last, in 0..1."""
     part = histogram[first : last + 1]
     return float((part * np.arange(first, last + 1)).sum() / part.sum() / 255)
 
 
-def splits(histogram: NDArray[np.float64]) -> Iterator[int]:
+def splits(histogram: Floats) -> Iterator[int]:
     """Yield Otsu's level of a histogram, then of its upper part, and again."""
     start = 0
     for _ in range(_SPLITS):
@@ -86,7 +84,7 @@ def splits(histogram: NDArray[np.float64]) -> Iterator[int]:
         yield start - 1
 
 
-def otsu_level(histogram: NDArray[np.float64]) -> int:
+def otsu_level(histogram: Floats) -> int:
     """Return the last level of the lower class (Otsu 1979, eq. 18)."""
     share = histogram / histogram.sum()
     weight, first = np.cumsum(share), np.cumsum(share * np.arange(len(share)))
@@ -95,7 +93,7 @@ def otsu_level(histogram: NDArray[np.float64]) -> int:
     return int(np.argmax(np.divide(rest, both, out=np.zeros_like(both), where=both > 1e-12)))
 
 
-def contrast(histogram: NDArray[np.float64], level: int) -> float:
+def contrast(histogram: Floats, level: int) -> float:
     """Return Ashman's D = (c1 - c2) / sqrt((v1 + v2) / 2) of the split above a level.
 
     c are the means and v the variances of the sides; a spread below one level counts as one.
@@ -110,20 +108,20 @@ def contrast(histogram: NDArray[np.float64], level: int) -> float:
     return float((c1 - c2) / max(((v1 + v2) / 2) ** 0.5, 1.0))
 
 
-def halved(region: Region) -> Bits:
+def halved(region: Bools) -> Bytes:
     """Return an (H, W) region at half resolution, 1 where most of the four pixels are set."""
     size = (max(1, region.shape[1] // 2), max(1, region.shape[0] // 2))
     small = cv2.resize(region.view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA)
     return np.asarray(small > 127).view(np.uint8)
 
 
-def compactness(small: Bits) -> float:
+def compactness(small: Bytes) -> float:
     """Return the share of a region at half resolution that an opening by a small cap leaves."""
     survives = cv2.countNonZero(cv2.morphologyEx(small, cv2.MORPH_OPEN, _kernel()))
     return float(survives / max(1, cv2.countNonZero(small)))
 
 
-def edge_step(image: Plane | Bits, small: Bits) -> float:
+def edge_step(image: Singles | Bytes, small: Bytes) -> float:
     """Return which share of the difference between two sides is crossed at their contour.
 
     Args:
@@ -145,7 +143,7 @@ def edge_step(image: Plane | Bits, small: Bits) -> float:
 
 
 @jit
-def _step(plane: NDArray[Any], masks: Bits) -> float:
+def _step(plane: NDArray[Any], masks: Bytes) -> float:
     """Return the difference of the means over the first two masks over that over the other two."""
     total, count = np.zeros(4), np.zeros(4)
     for k in range(4):
@@ -163,7 +161,7 @@ def _step(plane: NDArray[Any], masks: Bits) -> float:
     return float((mean[0] - mean[1]) / max(mean[2] - mean[3], 1e-6))
 
 
-def _kernel() -> Bits:
+def _kernel() -> Bytes:
     return np.asarray(
         cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_CAP_HALF_PX, _CAP_HALF_PX)), np.uint8
     )

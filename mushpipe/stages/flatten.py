@@ -12,17 +12,15 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from mushpipe import RgbdFrame, Stage
+from mushpipe.core.arrays import Bools, Bytes, Floats, Singles
 from mushpipe.core.jit import jit
 from mushpipe.stages.linear import normal_equations, solve
 from mushpipe.stages.otsu import otsu_foreground
 from mushpipe.stages.warm_up import example_frame
 
-Floats = NDArray[np.float64]
-Plane = NDArray[np.float32]
 _DARK = 2.0  # keeps the logarithm of black finite, on 0..255
 # Noise in the logarithm goes with the inverse of brightness: what is darker than this counts
 # little. The gaps of a real bed are black in any light.
@@ -52,7 +50,7 @@ class Flatten(Stage):
         return replace(frame, color=apply_gain(frame.color, np.asarray(gain, np.float32)))
 
 
-def light_field(gray: Plane, iterations: int) -> Plane:
+def light_field(gray: Singles, iterations: int) -> Singles:
     """Return the logarithm of the light over an (H, W) image in 0..255, with mean 0."""
     h = np.log(gray + _DARK)
     basis = _quadratic(*gray.shape)
@@ -74,7 +72,7 @@ def _quadratic(height: int, width: int) -> Floats:
 
 
 @jit
-def _fit(h: Floats, weight: Floats, basis: Floats, u: NDArray[np.bool_], rounds: int) -> Floats:
+def _fit(h: Floats, weight: Floats, basis: Floats, u: Bools, rounds: int) -> Floats:
     """Fit h = level of the class + basis k, and assign the classes u anew, round by round.
 
     Returns the light field basis k (M,); u is changed.
@@ -109,7 +107,7 @@ def _fit(h: Floats, weight: Floats, basis: Floats, u: NDArray[np.bool_], rounds:
 
 
 @jit
-def apply_gain(color: NDArray[np.uint8], gain: Plane) -> NDArray[np.uint8]:
+def apply_gain(color: Bytes, gain: Singles) -> Bytes:
     """Multiply an (H, W, 3) image by an (H, W) gain, rounded and clipped to 0..255."""
     out = np.empty_like(color)
     for y in range(color.shape[0]):

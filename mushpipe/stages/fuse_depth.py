@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr
 
 from mushpipe import RgbdFrame, Stage
+from mushpipe.core.arrays import Bytes, Singles
 from mushpipe.core.jit import jit
 from mushpipe.core.types import end_of_scale
 
-Singles = NDArray[np.float32]
 SIGMAS = 4.0  # of depth noise, which the gate lets pass
 PAUSE_NS = 1_000_000_000  # what was seen longer ago is no part of what is seen now
 
@@ -43,8 +43,8 @@ class FuseDepth(Stage):
     )
 
     _mean: Singles | None = PrivateAttr(None)
-    _count: NDArray[np.uint8] | None = PrivateAttr(None)
-    _age: NDArray[np.uint8] | None = PrivateAttr(None)
+    _count: Bytes | None = PrivateAttr(None)
+    _age: Bytes | None = PrivateAttr(None)
     _scale: float = PrivateAttr(0.0)
     _stamp_ns: int = PrivateAttr(0)
 

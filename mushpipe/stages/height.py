@@ -6,16 +6,15 @@ from typing import Self
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from mushpipe import Mask, RgbdFrame, Stage
+from mushpipe.core.arrays import Bools, Singles
 from mushpipe.core.jit import jit
 from mushpipe.stages.bed import bed_depth
 from mushpipe.stages.chan_vese_fast import solve_fast
 from mushpipe.stages.warm_up import example_frame
 
-Plane = NDArray[np.float32]
 REACH_PX = 32  # the widest gap that one side can fill: a shadow, or half of a shiny cap
 
 
@@ -57,7 +56,7 @@ class Height(Stage):
         return Mask(without_crumbs(region, self.smallest_px), initial)
 
 
-def without_crumbs(region: NDArray[np.bool_], diameter: float) -> NDArray[np.bool_]:
+def without_crumbs(region: Bools, diameter: float) -> Bools:
     """Return a region without the pieces of a smaller area than a disc of the diameter (px)."""
     count, label, stats, _ = cv2.connectedComponentsWithStats(region.view(np.uint8))
     keep = stats[:count, cv2.CC_STAT_AREA] >= np.pi / 4 * diameter**2
@@ -65,13 +64,13 @@ def without_crumbs(region: NDArray[np.bool_], diameter: float) -> NDArray[np.boo
     return np.asarray(keep[label])
 
 
-def height_map(frame: RgbdFrame, relief: bool = True) -> Plane | None:
+def height_map(frame: RgbdFrame, relief: bool = True) -> Singles | None:
     """Return (H, W) metres above the bed, holes filled; None without enough depth for a bed."""
     bed = bed_depth(frame.depth_m, relief) if frame.depth is not None else None
     return None if bed is None else filled(bed - frame.depth_m)
 
 
-def height_image(height: Plane, middle: float, highest: float) -> Plane:
+def height_image(height: Singles, middle: float, highest: float) -> Singles:
     """Return height as an image in 0..1 in which ``middle`` is 0.5 and what is too high is 0.
 
     It saturates as far above the middle as the bed lies below it, so that both classes weigh alike.
@@ -82,7 +81,7 @@ def height_image(height: Plane, middle: float, highest: float) -> Plane:
 
 
 @jit
-def filled(height: Plane) -> Plane:
+def filled(height: Singles) -> Singles:
     """Fill missing values from what is known on the four sides.
 
     Of two opposite sides the lower counts: between a cap and the bed lies a shadow on the bed,

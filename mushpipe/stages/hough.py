@@ -6,12 +6,11 @@ from typing import Annotated, Literal, Self
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from mushpipe import Circles, Mask, RgbdFrame, Stage
+from mushpipe.core.arrays import Bools, Floats, Rows, Singles
 
-Floats = NDArray[np.float64]
 Radius = Annotated[float, Field(gt=0)]
 
 
@@ -40,7 +39,7 @@ class _Peer(Stage):
         keep = covered[first_of_each_place(circles[covered], self.apart)]
         return Circles(circles[keep, :2], circles[keep, 2], score[keep])
 
-    def _candidates(self, gray: NDArray[np.float32]) -> Floats:
+    def _candidates(self, gray: Singles) -> Floats:
         """Return (N, 3) x, y, radius of circles in an image (H, W) of 0..1, the best first."""
         raise NotImplementedError
 
@@ -60,7 +59,7 @@ class Hough(_Peer):
     votes: float = Field(14, gt=0, description="`gradient`: fewest votes of a centre")
     min_distance_px: float = Field(12, gt=0, description="smallest distance of two centres, px")
 
-    def _candidates(self, gray: NDArray[np.float32]) -> Floats:
+    def _candidates(self, gray: Singles) -> Floats:
         image = np.rint(gray * 255).astype(np.uint8)
         alt = self.method == "alt"
         found = cv2.HoughCircles(
@@ -87,7 +86,7 @@ class HoughSkimage(_Peer):
     sigma: float = Field(1.5, gt=0, description="smoothing before Canny's edges, px")
     votes: float = Field(0.35, gt=0, le=1, description="least share of the outline with edges")
 
-    def _candidates(self, gray: NDArray[np.float32]) -> Floats:
+    def _candidates(self, gray: Singles) -> Floats:
         from skimage.feature import canny
         from skimage.transform import hough_circle, hough_circle_peaks
 
@@ -101,7 +100,7 @@ class HoughSkimage(_Peer):
         return np.column_stack([x, y, radius]).astype(np.float64)[order]
 
 
-def first_of_each_place(circles: Floats, apart: float) -> NDArray[np.intp]:
+def first_of_each_place(circles: Floats, apart: float) -> Rows:
     """Return the rows of (N, 3) circles that are not too near to a kept one before them."""
     kept: list[int] = []
     for row, (x, y, radius) in enumerate(circles):
@@ -112,7 +111,7 @@ def first_of_each_place(circles: Floats, apart: float) -> NDArray[np.intp]:
     return np.array(kept, np.intp)
 
 
-def disc_cover(foreground: NDArray[np.bool_], x: float, y: float, radius: float) -> float:
+def disc_cover(foreground: Bools, x: float, y: float, radius: float) -> float:
     """Return the share of a disc's pixels, as far as they lie in the image, that are set."""
     height, width = foreground.shape
     left, right = max(0, int(x - radius)), min(width, int(x + radius) + 2)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from mushpipe import Mask, RgbdFrame, Stage
+from mushpipe.core.arrays import Floats
 
 
 class KMeans(Stage):
@@ -28,7 +28,7 @@ class KMeans(Stage):
         return Mask(np.asarray(levels > thresholds(histogram, self.clusters)[-1]))
 
 
-def thresholds(histogram: NDArray[np.float64], clusters: int) -> NDArray[np.float64]:
+def thresholds(histogram: Floats, clusters: int) -> Floats:
     """Return the (clusters - 1,) last levels of all but the brightest cluster of a histogram.
 
     On a line the clusters are intervals, so dynamic programming finds the exact minimum of the
@@ -49,7 +49,7 @@ def thresholds(histogram: NDArray[np.float64], clusters: int) -> NDArray[np.floa
     return np.array(found[::-1], np.float64)
 
 
-def interval_costs(histogram: NDArray[np.float64]) -> NDArray[np.float64]:
+def interval_costs(histogram: Floats) -> Floats:
     """Return (n, n): the sum of squares about their mean of levels i to j; infinite for j < i."""
     value = np.arange(len(histogram))
     sums = [np.cumsum([0.0, *(histogram * value**k)]) for k in range(3)]

@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from mushpipe.core.arrays import Bytes, Floats, Singles
+
 _GRAY = 114  # what YOLO pads with
 
 
@@ -30,14 +31,14 @@ class Letterbox:
         left, top = ((c - i) // 2 for c, i in zip(self.canvas, self.inner, strict=True))
         return left, top
 
-    def fill(self, color: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def fill(self, color: Bytes) -> Bytes:
         """Return the canvas (h, w, 3) with the image (H, W, 3) in it."""
         canvas = np.full((*self.canvas[::-1], 3), _GRAY, np.uint8)
         (left, top), (width, height) = self.corner, self.inner
         canvas[top : top + height, left : left + width] = resized(color, self.inner)
         return canvas
 
-    def cut(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+    def cut(self, values: Singles) -> Singles:
         """Return the image's part (H, W) of values (h, w) that cover the canvas.
 
         Raises:

@@ -7,11 +7,9 @@ cores are busy.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Floats
 from mushpipe.core.jit import borrower, jit
-
-Floats = NDArray[np.float64]
 
 
 def least_squares(columns: Floats, target: Floats) -> Floats:

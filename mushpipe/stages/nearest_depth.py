@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from mushpipe import Camera, Circles, DepthSource, Locations, RgbdFrame, Stage
+from mushpipe.core.arrays import Bytes, Floats, Ints, Singles
 from mushpipe.core.geometry import lengths
 from mushpipe.core.jit import jit
 from mushpipe.stages.calibrated import calibration_of
 from mushpipe.stages.discs import discs_of
 from mushpipe.stages.warm_up import example_circles, example_frame
 
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
 _SIDES = np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
 
 
@@ -59,9 +57,7 @@ class NearestDepth(Stage):
             sigma_diameter=np.full(n, np.nan),
         )
 
-    def _positions(
-        self, depth: Singles, camera: Camera, discs: Floats
-    ) -> tuple[Floats, NDArray[np.uint8]]:
+    def _positions(self, depth: Singles, camera: Camera, discs: Floats) -> tuple[Floats, Bytes]:
         """Return positions (N, 3), m, and their sources (N,)."""
         n = len(discs)
         position, source = np.full((n, 3), np.nan), np.full(n, DepthSource.MISSING, np.uint8)
@@ -109,7 +105,7 @@ def box(depth: Singles, disc: Floats) -> tuple[int, int, int, int]:
 
 
 @jit
-def nearest(depth: Singles, discs: Floats, most: int, out: Floats) -> NDArray[np.int64]:
+def nearest(depth: Singles, discs: Floats, most: int, out: Floats) -> Ints:
     """Find the valid pixels next to each circle's centre, inside it.
 
     Args:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.stages.letterbox import Floats
+from mushpipe.core.arrays import Floats, Singles
 
 SHAPES = {
     "logits": "(1, C, h, w) or (1, h, w)",
@@ -26,7 +26,7 @@ _ROUNDED = 1e-3  # how far rounding takes a score out of 0..1
 _SHARE = 1.5  # boxes with no larger number are shares of the input, not px
 
 
-def probability(found: NDArray[Any], kind: str, class_id: int) -> NDArray[np.float32]:
+def probability(found: NDArray[Any], kind: str, class_id: int) -> Singles:
     """Return the probability (h, w) of a class.
 
     Args:

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 
 from mushpipe import Circles, GraphPath, Mask, RgbdFrame, Stage
+from mushpipe.core.arrays import Bools, Bytes, Floats, Singles
 from mushpipe.core.errors import UsageError
 from mushpipe.core.onnx_file import OnnxFile
 from mushpipe.stages.cap_decode import first_of_each
-from mushpipe.stages.letterbox import Floats, Letterbox, letterbox
+from mushpipe.stages.letterbox import Letterbox, letterbox
 from mushpipe.stages.onnx_layouts import PER_PIXEL, SHAPES, boxes_of, in_pixels, probability
 
 Triple = tuple[float, float, float]
@@ -122,7 +123,7 @@ class Onnx(Stage):
         canvas = fixed[0], fixed[1]
         return letterbox((width, height), canvas, enlarge=canvas != own)
 
-    def _values(self, canvas: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def _values(self, canvas: Bytes) -> Singles:
         """Return an image (h, w, 3) RGB as the model wants it, (1, 3, h, w)."""
         ordered = canvas[..., ::-1] if self.order == "bgr" else canvas
         values = (ordered / 255 - np.array(self.mean)) / np.array(self.std)
@@ -153,7 +154,7 @@ def _fits(shape: Sequence[Any], wanted: Sequence[int]) -> bool:
     return all(not isinstance(n, int) or n == size for n, size in zip(shape, wanted, strict=True))
 
 
-def pieces(likely: NDArray[np.float32], least: float) -> tuple[Mask, Circles]:
+def pieces(likely: Singles, least: float) -> tuple[Mask, Circles]:
     """Return where a probability (H, W) is at least `least`, and a circle per connected piece.
 
     A circle has the area and the centroid of its piece; its score is the mean probability there.
@@ -167,7 +168,7 @@ def pieces(likely: NDArray[np.float32], least: float) -> tuple[Mask, Circles]:
     return Mask(foreground), Circles(centers[1:][order], np.sqrt(area[order] / np.pi), score[order])
 
 
-def discs(circles: Floats, size: tuple[int, int]) -> NDArray[np.bool_]:
+def discs(circles: Floats, size: tuple[int, int]) -> Bools:
     """Return the union (H, W) of circles (N, 3) in an image of (width, height)."""
     width, height = size
     union = np.zeros((height, width), np.bool_)

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from mushpipe import Mask, RgbdFrame, Stage
+from mushpipe.core.arrays import Bools, Singles
 from mushpipe.stages.channels import Channel, channel_image
 from mushpipe.stages.evidence import Evidence, believed_foreground
 
 
-def otsu_foreground(gray: NDArray[np.float32]) -> NDArray[np.bool_]:
+def otsu_foreground(gray: Singles) -> Bools:
     """Return the pixels brighter than Otsu's threshold of an (H, W) image in 0..1.
 
     An image of one gray level has no two classes; its foreground is empty.
@@ -24,7 +24,7 @@ def otsu_foreground(gray: NDArray[np.float32]) -> NDArray[np.bool_]:
     return np.asarray(binary, np.uint8).view(np.bool_)
 
 
-def initial_contour(image: NDArray[np.float32], check: bool) -> Evidence:
+def initial_contour(image: Singles, check: bool) -> Evidence:
     """Return Otsu's foreground of an (H, W[, C]) image, or with ``check`` the believed one."""
     plane = image
     if image.ndim == 3:

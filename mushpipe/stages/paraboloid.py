@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Floats, Ints, Rows
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.cap_blocks import (
     CELLS,
@@ -25,7 +25,6 @@ from mushpipe.stages.cap_blocks import (
 )
 from mushpipe.stages.cap_samples import ray_at
 
-Floats = NDArray[np.float64]
 COEFFICIENTS = 7
 TIP = 6  # the coefficient that says how pointed a cap is
 ROUNDS = 3
@@ -44,13 +43,13 @@ INNER = np.flatnonzero((CELLS**2).sum(axis=1) < DISC**2)
 def fit_surfaces(
     image: Image,
     discs: Floats,
-    rank: NDArray[np.int64],
-    rows: NDArray[np.intp],
+    rank: Ints,
+    rows: Rows,
     focal: float,
     noise: tuple[float, float],
     least: int,
     out: tuple[Floats, Floats],
-) -> NDArray[np.int64]:
+) -> Ints:
     """Fit z = b0 + b1 x + b2 y + b3 x^2 + b4 x y + b5 y^2 + b6 q to caps, x and y in their radii.
 
     q = sqrt(x^2 + y^2 + BLUNT^2) - BLUNT is the tip of a pointed cap: a cone with a blunt end.

@@ -13,9 +13,9 @@ import math
 import cv2
 import numpy as np
 
+from mushpipe.core.arrays import Singles
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.phase_depth import CELL, Relief
-from mushpipe.stages.phase_edges import Plane
 from mushpipe.stages.phase_votes import highest_around
 
 LEVELS = (0.01, 0.014, 0.02, 0.028, 0.035, 0.05)  # m over the bed
@@ -27,7 +27,7 @@ _TURNS = 2 * np.pi * np.arange(16) / 16
 _COSINES, _SINES = np.cos(_TURNS), np.sin(_TURNS)
 
 
-def blobs_of(relief: Relief, smallest: float, largest: float) -> Plane:
+def blobs_of(relief: Relief, smallest: float, largest: float) -> Singles:
     """Return the discs of a radius (px) in the range that stand free, as candidates (N, 4)."""
     height, pixel = relief.filled[::STEP, ::STEP], CELL * STEP
     found = [np.zeros((0, 4), np.float32)]
@@ -40,7 +40,7 @@ def blobs_of(relief: Relief, smallest: float, largest: float) -> Plane:
 
 
 @jit
-def _distinct(discs: Plane) -> Plane:
+def _distinct(discs: Singles) -> Singles:
     """Return discs (N, 4) but for those that are the same, to half a step, as one before."""
     kept = 0
     for k in range(len(discs)):
@@ -55,7 +55,7 @@ def _distinct(discs: Plane) -> Plane:
 
 
 @jit
-def _discs(away: Plane, pixel: int, limits: tuple[float, float]) -> Plane:
+def _discs(away: Singles, pixel: int, limits: tuple[float, float]) -> Singles:
     height, width = away.shape
     found, count = np.empty((away.size // 4 + 1, 4), np.float32), 0
     for v in range(height):
@@ -72,7 +72,7 @@ def _discs(away: Plane, pixel: int, limits: tuple[float, float]) -> Plane:
 
 
 @borrower
-def _free(away: Plane, u: int, v: int) -> bool:
+def _free(away: Singles, u: int, v: int) -> bool:
     """Whether what is around a disc, as far as it lies in the image, is mostly lower."""
     height, width = away.shape
     inside = lower = 0

@@ -12,21 +12,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Bools, Floats, Ints32, Singles
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.discs import lens
-from mushpipe.stages.phase_edges import Rows, Shape, Singles
 from mushpipe.stages.phase_features import AT_LEARNED
-from mushpipe.stages.phase_refit import (
-    COSINES,
-    HIDDEN,
-    NARROW,
-    SINES,
-    Table,
-    around,
-    tolerance,
-)
+from mushpipe.stages.phase_refit import COSINES, HIDDEN, NARROW, SINES, around, tolerance
 from mushpipe.stages.phase_scratch import Scratch, scratch_for
 from mushpipe.stages.phase_strips import Strips
 from mushpipe.stages.verifier_net import Models, probability
@@ -38,7 +29,7 @@ TAKEN = 2.5  # px; edges so near an accepted outline are its own
 
 
 @borrower
-def overlap_features(shape: Shape, accepted: Table, row: Table) -> None:
+def overlap_features(shape: Floats, accepted: Floats, row: Floats) -> None:
     """Write overlap, spans and doubled into row[4], row[5], row[6]."""
     row[4] = row[5] = row[6] = 0
     own = math.pi * shape[2] ** 2
@@ -53,7 +44,7 @@ def overlap_features(shape: Shape, accepted: Table, row: Table) -> None:
 
 
 @borrower
-def covered(x: Singles, y: Singles, circles: Table, margin: float, under: Rows) -> None:
+def covered(x: Singles, y: Singles, circles: Floats, margin: float, under: Ints32) -> None:
     """Write 1 for points (N,) that lie within one of the circles by more than a margin (px)."""
     for k in range(len(x)):
         under[k] = 0
@@ -67,7 +58,7 @@ def covered(x: Singles, y: Singles, circles: Table, margin: float, under: Rows) 
 
 @borrower
 def outline_features(
-    edges: Strips, shape: Shape, hits: Rows, owner: Rows, accepted: Table, row: Table,
+    edges: Strips, shape: Floats, hits: Ints32, owner: Ints32, accepted: Floats, row: Floats,
     scratch: Scratch,
 ) -> None:  # fmt: skip
     """Write free, support, trust and hits into row[0..3].
@@ -104,7 +95,7 @@ def outline_features(
 
 @borrower
 def chance_beside(
-    edges: Strips, shape: Shape, hits: Rows, owner: Rows, accepted: Table, row: Table,
+    edges: Strips, shape: Floats, hits: Ints32, owner: Ints32, accepted: Floats, row: Floats,
     models: Models, which: int, scratch: Scratch,
 ) -> float:  # fmt: skip
     """Return the probability of a candidate beside the accepted; writes what depends on them."""
@@ -114,7 +105,7 @@ def chance_beside(
 
 
 @borrower
-def _use_up(edges: Strips, shape: Shape, number: int, owner: Rows, scratch: Scratch) -> None:
+def _use_up(edges: Strips, shape: Floats, number: int, owner: Ints32, scratch: Scratch) -> None:
     rows, nothing = scratch.rows, scratch.lanes[:0]
     count = around(edges, nothing, 0.0, shape, NARROW, scratch)
     near = max(TAKEN, 1.3 * tolerance(shape[2]))
@@ -129,9 +120,9 @@ def _use_up(edges: Strips, shape: Shape, number: int, owner: Rows, scratch: Scra
 
 @jit
 def decide(
-    edges: Strips, shapes: Table, hits: Rows, table: Table, which: Rows, models: Models,
+    edges: Strips, shapes: Floats, hits: Ints32, table: Floats, which: Ints32, models: Models,
     least: float, led: bool,
-) -> tuple[Rows, Table, Rows]:  # fmt: skip
+) -> tuple[Ints32, Floats, Ints32]:  # fmt: skip
     """Accept candidates in the order of their probability.
 
     Args:
@@ -184,7 +175,7 @@ def decide(
 
 
 @jit
-def neighbours(shapes: Table) -> tuple[Rows, Rows]:
+def neighbours(shapes: Floats) -> tuple[Ints32, Ints32]:
     """Return the outlines so near each outline (N, 5) that accepting one may change the other.
 
     Returns:
@@ -220,7 +211,7 @@ def neighbours(shapes: Table) -> tuple[Rows, Rows]:
 
 
 @borrower
-def _accepted(shapes: Table, waiting: NDArray[np.bool_], beside: Rows, near: Table) -> int:
+def _accepted(shapes: Floats, waiting: Bools, beside: Ints32, near: Floats) -> int:
     """Write the accepted of some outlines to the first rows of `near`; return how many."""
     count = 0
     for k in beside:

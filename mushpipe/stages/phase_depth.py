@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe import RgbdFrame
+from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.jit import inlined, jit
 from mushpipe.core.types import end_of_scale
 from mushpipe.stages.bed import far_cells, fit_plane, plane_depth
-from mushpipe.stages.phase_edges import Edges, Plane, depth_edges
+from mushpipe.stages.phase_edges import Edges, depth_edges
 
 CELL = 2  # px of the image per px of the height map
 GRID = 16  # px of the height map per cell of the bed's fit
@@ -23,7 +24,7 @@ FARTHEST = np.float32(1e9)  # native; beyond is no depth
 STEEP = 1.0  # slope of an edge, height over length
 
 
-def halved(depth: NDArray[Any], scale: float) -> Plane:
+def halved(depth: NDArray[Any], scale: float) -> Singles:
     """Return the mean of the valid depths of each 2 x 2 px in metres, -1 where there is none."""
     odd = depth.shape[0] % 2, depth.shape[1] % 2
     if any(odd):  # a row that stands twice changes no mean
@@ -39,7 +40,7 @@ def _if_known(value: Any, end: np.float32) -> Any:
 
 
 @jit
-def _halved(depth: NDArray[Any], scale: float, end: np.float32) -> Plane:
+def _halved(depth: NDArray[Any], scale: float, end: np.float32) -> Singles:
     """Do the work of `halved` for an even size; without branches, so that SIMD does it."""
     height, width = depth.shape[0] // 2, depth.shape[1] // 2
     out = np.empty((height, width), np.float32)
@@ -59,7 +60,7 @@ def _halved(depth: NDArray[Any], scale: float, end: np.float32) -> Plane:
 
 
 @jit
-def _heights(depth: Plane, plane: NDArray[np.float64]) -> Plane:
+def _heights(depth: Singles, plane: Floats) -> Singles:
     """Turn depths into heights over the plane of `fit_plane`; -1 m stands for unknown."""
     height, width = depth.shape
     out = np.empty_like(depth)
@@ -73,7 +74,7 @@ def _heights(depth: Plane, plane: NDArray[np.float64]) -> Plane:
 
 
 @jit
-def closed(height: Plane) -> Plane:
+def closed(height: Singles) -> Singles:
     """Close gaps of up to `FILL` px along rows, then columns, by the lower of both ends.
 
     What hides behind a cap's rim, or in the shadow of the projector, lies low. Wider gaps stay.
@@ -106,15 +107,13 @@ class Relief:
         pixel: Size of a pixel of the full image on the bed, m, in the middle of what is seen.
     """
 
-    def __init__(
-        self, depth: Plane, height: Plane, plane: NDArray[np.float64], focal: float
-    ) -> None:
+    def __init__(self, depth: Singles, height: Singles, plane: Floats, focal: float) -> None:
         self.depth, self.height, self.plane, self.focal = depth, height, plane, focal
         self.filled = closed(height)
         known = depth[depth > 0]
         self.pixel = float(np.median(known[:: max(1, len(known) // 2000)])) / focal
 
-    def bed_pixel(self, x: Any, y: Any) -> NDArray[np.float64]:
+    def bed_pixel(self, x: Any, y: Any) -> Floats:
         """Return the size, m, of a pixel of the full image on the bed at x, y (px)."""
         return plane_depth(self.plane, (x - 0.5) / CELL, (y - 0.5) / CELL) / self.focal
 

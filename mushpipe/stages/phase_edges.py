@@ -5,15 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Bytes, Ints32, Singles
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.phase_thin import thin
 
-Plane = NDArray[np.float32]
-Singles = NDArray[np.float32]
-Rows = NDArray[np.int32]
-Shape = NDArray[np.float64]
 SIGMA = 1.1
 DEPTH_ALONE = 0.6  # weight of a depth edge without a gray one
 # Between two caps the steepest step lies within the shaded rim, not on the outline. How far within
@@ -36,9 +32,9 @@ class Gradient(NamedTuple):
         size: (H, W) magnitude.
     """
 
-    x: Plane
-    y: Plane
-    size: Plane
+    x: Singles
+    y: Singles
+    size: Singles
 
 
 class Edges(NamedTuple):
@@ -60,7 +56,7 @@ class Edges(NamedTuple):
 
 
 @jit
-def gradient(image: Plane, smooth: Singles, slope: Singles) -> tuple[Plane, Plane, Plane]:
+def gradient(image: Singles, smooth: Singles, slope: Singles) -> tuple[Singles, Singles, Singles]:
     """Return the derivatives by x and y and the magnitude, by 7 taps each way; borders repeat."""
     height, width = image.shape
     gx, gy, size = np.empty_like(image), np.empty_like(image), np.empty_like(image)
@@ -95,13 +91,13 @@ def gradient(image: Plane, smooth: Singles, slope: Singles) -> tuple[Plane, Plan
     return gx, gy, size
 
 
-def gradient_of(image: Plane) -> Gradient:
+def gradient_of(image: Singles) -> Gradient:
     """Return the gradient of an (H, W) float32 image."""
     return Gradient(*gradient(image, SMOOTH, SLOPE))
 
 
 @jit
-def otsu_of(size: Plane, top: float) -> float:
+def otsu_of(size: Singles, top: float) -> float:
     """Return Otsu's threshold (1979) of the values at every second pixel, in 256 bins to `top`."""
     bins = np.zeros(256, np.int64)
     scale = np.float32(256 / top)
@@ -126,7 +122,7 @@ def otsu_of(size: Plane, top: float) -> float:
 
 @borrower
 def _looked_up(
-    image: Plane, x: Singles, y: Singles, nx: Singles, ny: Singles, t: float, out: Singles
+    image: Singles, x: Singles, y: Singles, nx: Singles, ny: Singles, t: float, out: Singles
 ) -> None:
     """Write the values of the pixels at a distance from points along their normals."""
     height, width = np.int32(image.shape[0] - 1), np.int32(image.shape[1] - 1)
@@ -138,7 +134,9 @@ def _looked_up(
 
 
 @jit
-def _beyond_over_before(image: Plane, x: Singles, y: Singles, nx: Singles, ny: Singles) -> Singles:
+def _beyond_over_before(
+    image: Singles, x: Singles, y: Singles, nx: Singles, ny: Singles
+) -> Singles:
     """Return how bright it is beyond edges, which the normals point away from, over before them."""
     inside, near, far = np.empty((3, len(x)), np.float32)
     _looked_up(image, x, y, nx, ny, 3.0, inside)
@@ -151,8 +149,8 @@ def _beyond_over_before(image: Plane, x: Singles, y: Singles, nx: Singles, ny: S
 
 
 def edges_of(
-    image: Plane, grad: Gradient, region: NDArray[np.uint8], threshold: float, full: float
-) -> tuple[Edges, Rows]:
+    image: Singles, grad: Gradient, region: Bytes, threshold: float, full: float
+) -> tuple[Edges, Ints32]:
     """Return the thin edges of an image in the place of the outlines they stand for.
 
     Args:
@@ -174,14 +172,14 @@ def edges_of(
     return Edges(x - outward * nx, y - outward * ny, nx, ny, weight), index
 
 
-def depth_edges(height: Plane, threshold: float) -> Edges:
+def depth_edges(height: Singles, threshold: float) -> Edges:
     """Return the thin edges of a height map (H, W), all of the same weight."""
     region = np.ones(height.shape, np.uint8)
     (x, y, nx, ny, strength, _, _), _ = _thin_edges(gradient_of(height), region, threshold)
     return Edges(x, y, nx, ny, np.full_like(strength, DEPTH_ALONE))
 
 
-def _thin_edges(grad: Gradient, region: NDArray[np.uint8], threshold: float) -> tuple[Plane, Rows]:
+def _thin_edges(grad: Gradient, region: Bytes, threshold: float) -> tuple[Singles, Ints32]:
     index = np.full(grad.size.shape, -1, np.int32)
     room, pixels = grad.size.size // 6 + 16, grad.size.size
     points = np.empty((7, room), np.float32)

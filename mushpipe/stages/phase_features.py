@@ -9,18 +9,17 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Bytes, Floats, Ints32, Singles
 from mushpipe.core.jit import borrower
 from mushpipe.stages.linear import solve
-from mushpipe.stages.phase_edges import Gradient, Plane, Rows, Shape
-from mushpipe.stages.phase_refit import COSINES, HIDDEN, SINES, Table
+from mushpipe.stages.phase_edges import Gradient
+from mushpipe.stages.phase_refit import COSINES, HIDDEN, SINES
 from mushpipe.stages.phase_scratch import DIRECTIONS
 from mushpipe.stages.phase_steps import height_at, rises, step_up
 
-Bytes = NDArray[np.uint8]
 # heights and weights (P,), normal matrix (6, 6) and its right side, and (2, DIRECTIONS)
-Room = tuple[Table, Table, Table, Table, Plane]
+Room = tuple[Floats, Floats, Floats, Floats, Singles]
 
 # How bright a cap is against what is beside it is none of them: simulated beds are fuller than real
 # ones, so a cap with dark soil all around it counted as less likely than one in a cluster.
@@ -76,8 +75,8 @@ def _pixel(x: float, y: float, width: int, height: int) -> tuple[int, int]:
 
 @borrower
 def disc_features(
-    image: Plane, gx: Plane, gy: Plane, size: Plane, mask: Bytes, shape: Shape, rings: Table,
-    row: Table,
+    image: Singles, gx: Singles, gy: Singles, size: Singles, mask: Bytes, shape: Floats,
+    rings: Floats, row: Floats,
 ) -> None:  # fmt: skip
     """Write cover, coherence and texture of a disc, sampled on a polar grid, into row[0..2].
 
@@ -105,7 +104,7 @@ def disc_features(
 
 
 @borrower
-def _quadric(z: Table, sigma: float, before: Table, a: Table, weight: Table) -> float:
+def _quadric(z: Floats, sigma: float, before: Floats, a: Floats, weight: Floats) -> float:
     """Fit z = b0 + b1 u + b2 v + b3 u^2 + b4 u v + b5 v^2 to heights z (P,) m, -1 for unknown.
 
     Args:
@@ -143,7 +142,7 @@ def _quadric(z: Table, sigma: float, before: Table, a: Table, weight: Table) -> 
 
 
 @borrower
-def _misfit(z: float, k: int, b: Table) -> float:
+def _misfit(z: float, k: int, b: Floats) -> float:
     """Return how far (m) the height of the k-th point lies from a quadric."""
     plane = b[0] + b[1] * _BY_TERM[1, k] + b[2] * _BY_TERM[2, k]
     bend = b[3] * _BY_TERM[3, k] + b[4] * _BY_TERM[4, k] + b[5] * _BY_TERM[5, k]
@@ -151,7 +150,9 @@ def _misfit(z: float, k: int, b: Table) -> float:
 
 
 @borrower
-def surface_features(height: Plane, shape: Shape, pixel: float, row: Table, room: Room) -> float:
+def surface_features(
+    height: Singles, shape: Floats, pixel: float, row: Floats, room: Room
+) -> float:
     """Write height, bend_small, bend_large, roughness and gap into row[0..3] and row[6].
 
     Args:
@@ -186,7 +187,7 @@ def surface_features(height: Plane, shape: Shape, pixel: float, row: Table, room
 
 @borrower
 def edge_features(
-    height: Plane, shape: Shape, pixel: float, hits: Rows, row: Table, lanes: Plane
+    height: Singles, shape: Floats, pixel: float, hits: Ints32, row: Floats, lanes: Singles
 ) -> None:
     """Write drop and rise into row[4], row[5]; mark directions of `hits` with a rise as hidden."""
     step = step_up(shape[2] * pixel)
@@ -211,9 +212,9 @@ def edge_features(
 
 @borrower
 def _static(
-    image: Plane, gx: Plane, gy: Plane, size: Plane, mask: Bytes, height: Plane, pixel: float,
-    shapes: Table, hits: Rows, residual: Plane, rings: Table, table: Table, middle: Table,
-    places: tuple[int, int], room: Room,
+    image: Singles, gx: Singles, gy: Singles, size: Singles, mask: Bytes, height: Singles,
+    pixel: float, shapes: Floats, hits: Ints32, residual: Singles,
+    rings: Floats, table: Floats, middle: Floats, places: tuple[int, int], room: Room,
 ) -> None:  # fmt: skip
     first, depth = places
     for k in range(len(shapes)):
@@ -229,9 +230,9 @@ def _static(
 
 
 def static_features(
-    image: Plane, grad: Gradient, mask: Bytes, height: Plane, pixel: float,
-    shapes: Table, hits: Rows, residual: Plane,
-) -> tuple[Table, Table]:  # fmt: skip
+    image: Singles, grad: Gradient, mask: Bytes, height: Singles, pixel: float,
+    shapes: Floats, hits: Ints32, residual: Singles,
+) -> tuple[Floats, Floats]:  # fmt: skip
     """Return all features that do not depend on other candidates, (N, F), and heights (N,) m.
 
     The others are 0. A height is NaN where depth is missing, and the features of depth then 0.

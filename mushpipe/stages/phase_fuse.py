@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Bools, Ints32, Singles
 from mushpipe.core.jit import jit
-from mushpipe.stages.phase_edges import DEPTH_ALONE, Edges, Rows, Singles
+from mushpipe.stages.phase_edges import DEPTH_ALONE, Edges
 
 UNCONFIRMED = 0.4  # weight of a gray edge without a depth edge beside it
 DEPTH_OUTWARD = 0.6  # px; a depth camera loses that much of a surface at its edge
@@ -14,9 +14,9 @@ DEPTH_OUTWARD = 0.6  # px; a depth camera loses that much of a surface at its ed
 
 @jit
 def confirm(
-    x: Singles, y: Singles, nx: Singles, ny: Singles, gray: Edges, pixels: Rows, trust: Singles,
+    x: Singles, y: Singles, nx: Singles, ny: Singles, gray: Edges, pixels: Ints32, trust: Singles,
     reach: int,
-) -> NDArray[np.bool_]:  # fmt: skip
+) -> Bools:  # fmt: skip
     """Give the gray edges that a depth edge runs along their trust; return the edges without one.
 
     Args:
@@ -49,7 +49,7 @@ def confirm(
     return alone
 
 
-def fused(gray: Edges, pixels: Rows, depth: Edges, scale: float) -> Edges:
+def fused(gray: Edges, pixels: Ints32, depth: Edges, scale: float) -> Edges:
     """Return gray edges, and the depth edges that lie where there is no gray one.
 
     A gray edge without a depth edge beside it may be a shadow, dirt or shading: it weighs less.

@@ -7,24 +7,17 @@ from typing import Annotated, ClassVar, Literal, Self
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 
 from mushpipe import Circles, Mask, RgbdFrame, Stage, UsageError
+from mushpipe.core.arrays import Bools, Bytes, Floats, Ints32, Singles
 from mushpipe.core.paths import GraphPath
 from mushpipe.stages.discs import certain_first
 from mushpipe.stages.doubling import doubled
 from mushpipe.stages.phase_blobs import blobs_of
 from mushpipe.stages.phase_decide import LIKELY, decide
 from mushpipe.stages.phase_depth import NO_RELIEF, Relief, relief_of
-from mushpipe.stages.phase_edges import (
-    Gradient,
-    Plane,
-    Rows,
-    edges_of,
-    gradient_of,
-    otsu_of,
-)
+from mushpipe.stages.phase_edges import Gradient, edges_of, gradient_of, otsu_of
 from mushpipe.stages.phase_features import AT_LEARNED, static_features
 from mushpipe.stages.phase_fuse import fused
 from mushpipe.stages.phase_learned import (
@@ -37,7 +30,7 @@ from mushpipe.stages.phase_learned import (
     without_clods,
 )
 from mushpipe.stages.phase_polish import polish
-from mushpipe.stages.phase_refit import Table, refit
+from mushpipe.stages.phase_refit import refit
 from mushpipe.stages.phase_strips import Strips, in_strips
 from mushpipe.stages.phase_verifier import load_verifier
 from mushpipe.stages.phase_votes import CELL, centres
@@ -45,7 +38,7 @@ from mushpipe.stages.verifier_net import Models
 from mushpipe.stages.warm_up import example_circles, example_frame
 
 Positive = Annotated[float, Field(gt=0)]
-Bytes = NDArray[np.uint8]
+
 _FLOOR = 4.0  # gray levels per px; Otsu's threshold of an image without edges is noise
 _TOP = 64.0  # gray levels per px; larger gradients count as this in Otsu's threshold
 _AROUND = np.ones((7, 7), np.uint8)  # edges are taken so far around the foreground
@@ -76,11 +69,11 @@ class Evidence:
     """
 
     edges: Strips
-    shapes: Table
-    hits: Rows
-    table: Table
-    middle: Table
-    height: Plane
+    shapes: Floats
+    hits: Ints32
+    table: Floats
+    middle: Floats
+    height: Singles
     pixel: float
     range: tuple[float, float]
     learned: Circles | None
@@ -225,7 +218,7 @@ class PhaseHough(Stage):
         parts = (shapes[kept], hits[kept], table[kept], middle[kept])
         return Evidence(edges, *parts, high, pixel, limits, known)
 
-    def decide(self, found: Evidence, led: bool = False) -> tuple[Rows, Table, Rows]:
+    def decide(self, found: Evidence, led: bool = False) -> tuple[Ints32, Floats, Ints32]:
         """Return the accepted rows in their order, all probabilities, and whose each edge is.
 
         `led` is whether the network has a say in the order of the likely ones.
@@ -259,7 +252,7 @@ class PhaseHough(Stage):
         return smallest, min(largest, max(height, width) / 2)
 
     def _edges(
-        self, image: Plane, gradient: Gradient, region: Bytes, relief: Relief | None
+        self, image: Singles, gradient: Gradient, region: Bytes, relief: Relief | None
     ) -> Strips:
         otsu = max(otsu_of(gradient.size, _TOP), _FLOOR)
         edges, pixels = edges_of(image, gradient, region, self.edge * otsu, 1.2 * otsu)
@@ -267,7 +260,7 @@ class PhaseHough(Stage):
             edges = fused(edges, pixels, relief.edges(), CELL)
         return in_strips(edges, *image.shape)
 
-    def _plausible(self, shapes: Table, middle: Table, relief: Relief | None) -> NDArray[np.bool_]:
+    def _plausible(self, shapes: Floats, middle: Floats, relief: Relief | None) -> Bools:
         """Return which candidates have a possible diameter in metres, or none that is known."""
         inside = np.ones(len(shapes), bool)
         if relief is not None:
@@ -287,7 +280,7 @@ class PhaseHough(Stage):
         self.process(replace(frame, depth=None), mask, example_circles())
 
 
-def equal_area_radius(shapes: Table) -> Table:
+def equal_area_radius(shapes: Floats) -> Floats:
     """Return the radii (N,) of the circles with the area of the outlines (N, 5)."""
     return np.asarray(np.sqrt(shapes[:, 2] ** 2 + (shapes[:, 3] ** 2 + shapes[:, 4] ** 2) / 2))
 

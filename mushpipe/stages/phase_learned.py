@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mushpipe import Circles
+from mushpipe.core.arrays import Bools, Bytes, Floats, Ints32, Singles
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.cap_clod import off_ground
 from mushpipe.stages.cap_kin import tones_of
 from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE, certain_first, iou, lens
-from mushpipe.stages.phase_edges import Plane, Rows
-from mushpipe.stages.phase_refit import Table
 
 _AROUND = 4.0  # px; a circle of a network is not more exact than that
 _SAME = 0.5  # IoU from which on an outline is that of a circle
@@ -35,19 +33,19 @@ def largest_of(learned: Circles | None, least: float) -> float:
     return float(MOST_OF_RANGE * learned.radius[learned.score >= least].max(initial=0.0))
 
 
-def candidates_of(learned: Circles) -> Plane:
+def candidates_of(learned: Circles) -> Singles:
     """Return circles as candidates (N, 4) for a refit."""
     return np.column_stack([learned.center, learned.radius, learned.score]).astype(np.float32)
 
 
-def add_discs(learned: Circles, foreground: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def add_discs(learned: Circles, foreground: Bytes) -> Bytes:
     """Return a foreground (H, W) with 1 in the circles and a little around them as well."""
     added = foreground.copy()
     _fill(added, learned.center, learned.radius)
     return added
 
 
-def agreement(shapes: Table, radius: Table, learned: Circles) -> Table:
+def agreement(shapes: Floats, radius: Floats, learned: Circles) -> Floats:
     """Return how far each outline (N, 5) of a radius (N,) is one of the circles: 0..1.
 
     The largest score of a circle, times its IoU with the outline's circle.
@@ -55,7 +53,7 @@ def agreement(shapes: Table, radius: Table, learned: Circles) -> Table:
     return _agreement(shapes, radius, learned.center, learned.radius, learned.score)
 
 
-def without_clods(color: NDArray[np.uint8], circles: Circles, unseen: NDArray[np.bool_]) -> Circles:
+def without_clods(color: Bytes, circles: Circles, unseen: Bools) -> Circles:
     """Return the circles but for those that the network sees nothing of and that look like ground.
 
     A round clod has the form of a cap in depth as well. Caps that the network sees nothing of are
@@ -77,7 +75,7 @@ def without_clods(color: NDArray[np.uint8], circles: Circles, unseen: NDArray[np
 
 
 def with_bare(
-    circles: Circles, sure: Circles, shapes: Table, radius: Table, likely: Rows
+    circles: Circles, sure: Circles, shapes: Floats, radius: Floats, likely: Ints32
 ) -> Circles:
     """Return the accepted circles, and sure ones of a network that no outline was found of.
 
@@ -98,9 +96,7 @@ def with_bare(
 
 
 @jit
-def _bare(
-    center: Table, of: Table, shapes: Table, radius: Table, taken: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
+def _bare(center: Floats, of: Floats, shapes: Floats, radius: Floats, taken: Bools) -> Bools:
     free = np.ones(len(center), np.bool_)
     for m in range(len(center)):
         own = math.pi * of[m] ** 2
@@ -115,7 +111,7 @@ def _bare(
 
 
 @borrower
-def _fill(foreground: NDArray[np.uint8], center: Table, radius: Table) -> None:
+def _fill(foreground: Bytes, center: Floats, radius: Floats) -> None:
     height, width = foreground.shape
     for k in range(len(center)):
         x, y, reach = center[k, 0], center[k, 1], radius[k] + _AROUND
@@ -126,7 +122,7 @@ def _fill(foreground: NDArray[np.uint8], center: Table, radius: Table) -> None:
 
 
 @jit
-def _agreement(shapes: Table, radius: Table, center: Table, of: Table, score: Table) -> Table:
+def _agreement(shapes: Floats, radius: Floats, center: Floats, of: Floats, score: Floats) -> Floats:
     best = np.zeros(len(shapes))
     for k in range(len(shapes)):
         for m in range(len(center)):

@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
+from mushpipe.core.arrays import Floats, Ints32, Singles
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE
 from mushpipe.stages.phase_decide import covered
-from mushpipe.stages.phase_edges import Plane, Rows, Shape, Singles
-from mushpipe.stages.phase_refit import NARROW, Table, around, fit_outline
+from mushpipe.stages.phase_refit import NARROW, around, fit_outline
 from mushpipe.stages.phase_scratch import Scratch, scratch_for
 from mushpipe.stages.phase_strips import Strips
 
@@ -19,7 +19,7 @@ OWN = 24  # edge points with which an outline is fitted to what is its own
 
 
 @borrower
-def _met(shape: Shape, accepted: Table, found: Table) -> int:
+def _met(shape: Floats, accepted: Floats, found: Floats) -> int:
     """Write the accepted outlines whose circle meets the circle of a shape; return how many."""
     count = 0
     for k in range(len(accepted)):
@@ -34,7 +34,7 @@ def _met(shape: Shape, accepted: Table, found: Table) -> int:
 
 @borrower
 def _keep_own(
-    edges: Strips, k: int, count: int, near: Table, owner: Rows, x: Singles, y: Singles,
+    edges: Strips, k: int, count: int, near: Floats, owner: Ints32, x: Singles, y: Singles,
     scratch: Scratch,
 ) -> int:  # fmt: skip
     """Keep of the first `scratch.rows` those that are an outline's own; return how many.
@@ -63,7 +63,7 @@ def _keep_own(
 
 @jit
 def polish(
-    edges: Strips, height: Plane, pixel: float, outlines: Table, owner: Rows,
+    edges: Strips, height: Singles, pixel: float, outlines: Floats, owner: Ints32,
     smallest: float, largest: float,
 ) -> None:  # fmt: skip
     """Refit accepted outlines (K, 5), in their order and in place, to what is theirs alone.

@@ -11,17 +11,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Floats, Ints32, Singles
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE
 from mushpipe.stages.linear import solve
-from mushpipe.stages.phase_edges import Plane, Rows, Shape, Singles
 from mushpipe.stages.phase_scratch import DIRECTIONS, Scratch, scratch_for
 from mushpipe.stages.phase_steps import step_up
 from mushpipe.stages.phase_strips import TURNED, Strips, gather, outline_hits
 
-Table = NDArray[np.float64]
 # Cosine and sine of each direction, by how many directions there are.
 _TURNS = 2 * np.pi * np.arange(DIRECTIONS) / np.maximum(np.arange(DIRECTIONS + 1), 1)[:, None]
 COSINES, SINES = np.cos(_TURNS).astype(np.float32), np.sin(_TURNS).astype(np.float32)
@@ -54,7 +52,7 @@ def tolerance(radius: float) -> float:
 
 @borrower
 def _accumulate(
-    edges: Strips, rows: Rows, count: int, shape: Shape, scale: float, a: Table, b: Table
+    edges: Strips, rows: Ints32, count: int, shape: Floats, scale: float, a: Floats, b: Floats
 ) -> float:
     """Write the normal equations of the edge points to a (5, 5), b (5,); return the weights' sum.
 
@@ -94,7 +92,7 @@ def _accumulate(
 
 
 @borrower
-def fit_outline(edges: Strips, count: int, shape: Shape, stage: int, scratch: Scratch) -> bool:
+def fit_outline(edges: Strips, count: int, shape: Floats, stage: int, scratch: Scratch) -> bool:
     """Improve x, y, r, p, q (5,) in place by the first points of `scratch.rows`.
 
     False where they do not hold it in place.
@@ -124,7 +122,7 @@ def fit_outline(edges: Strips, count: int, shape: Shape, stage: int, scratch: Sc
 
 @borrower
 def around(
-    edges: Strips, height: Plane, pixel: float, shape: Shape, stage: int, scratch: Scratch
+    edges: Strips, height: Singles, pixel: float, shape: Floats, stage: int, scratch: Scratch
 ) -> int:
     """Write the rows of edge points around an outline into `scratch.rows`; return how many."""
     reach = max(3.0, REACH[stage] * shape[2])
@@ -134,7 +132,7 @@ def around(
 
 @borrower
 def fit_around(
-    edges: Strips, height: Plane, pixel: float, shape: Shape, stage: int, scratch: Scratch
+    edges: Strips, height: Singles, pixel: float, shape: Floats, stage: int, scratch: Scratch
 ) -> bool:
     """Fit an outline (5,) to the edge points around it, in place; False if they do not hold it."""
     count = around(edges, height, pixel, shape, stage, scratch)
@@ -143,8 +141,13 @@ def fit_around(
 
 @jit
 def refit(
-    edges: Strips, height: Plane, pixel: float, candidates: Plane, smallest: float, largest: float
-) -> tuple[Table, Rows, Singles]:
+    edges: Strips,
+    height: Singles,
+    pixel: float,
+    candidates: Singles,
+    smallest: float,
+    largest: float,
+) -> tuple[Floats, Ints32, Singles]:
     """Refit candidates (N, 4) to the edges; those that nothing holds in place are dropped.
 
     Args:
@@ -197,21 +200,21 @@ def refit(
 
 
 @borrower
-def _cell(shape: Shape, cells: Rows) -> tuple[int, int]:
+def _cell(shape: Floats, cells: Ints32) -> tuple[int, int]:
     """Return row and column of an outline's centre in a grid; places beyond it count as its rim."""
     row = min(max(int(shape[1] / BUCKET), 1), cells.shape[0] - 2)
     return row, min(max(int(shape[0] / BUCKET), 1), cells.shape[1] - 2)
 
 
 @borrower
-def _enter(shape: Shape, number: int, cells: Rows, following: Rows) -> None:
+def _enter(shape: Floats, number: int, cells: Ints32, following: Ints32) -> None:
     """Enter an outline in the grid; arguments as `_known`."""
     row, column = _cell(shape, cells)
     following[number], cells[row, column] = cells[row, column], number
 
 
 @borrower
-def _known(shape: Shape, others: Table, cells: Rows, following: Rows) -> bool:
+def _known(shape: Floats, others: Floats, cells: Ints32, following: Ints32) -> bool:
     """Whether another outline is the same but for a few per cent.
 
     `cells` holds the last outline entered in each cell of a grid, `following` the one before it.

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Floats, Ints32, Singles
 from mushpipe.core.jit import jit
-from mushpipe.stages.phase_edges import Plane, Rows, Singles
 from mushpipe.stages.verifier_net import WIDTHS
 
 DIRECTIONS = 96  # in which an outline is looked at, at most
@@ -30,13 +29,13 @@ class Scratch(NamedTuple):
         second: (K,) those of its next layer.
     """
 
-    rows: Rows
-    near: Rows
-    off: Rows
-    under: Rows
-    lanes: Plane
-    a: NDArray[np.float64]
-    b: NDArray[np.float64]
+    rows: Ints32
+    near: Ints32
+    off: Ints32
+    under: Ints32
+    lanes: Singles
+    a: Floats
+    b: Floats
     first: Singles
     second: Singles
 

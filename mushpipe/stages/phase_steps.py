@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.jit import borrower
-from mushpipe.stages.phase_edges import Plane, Shape, Singles
 
 STEP_UP = 0.004  # m
 
@@ -17,7 +17,7 @@ def step_up(radius: float) -> float:
 
 
 @borrower
-def height_at(height: Plane, x: float, y: float) -> float:
+def height_at(height: Singles, x: float, y: float) -> float:
     """Return the height (m) at an image point; -1 where it is unknown."""
     u, v = int((x + 0.5) * 0.5), int((y + 0.5) * 0.5)
     right, bottom = height.shape[1] - 1, height.shape[0] - 1
@@ -28,7 +28,7 @@ def height_at(height: Plane, x: float, y: float) -> float:
 
 @borrower
 def _raise(
-    plane: Plane, x: float, y: float, c: Singles, s: Singles, t: float, out: Singles
+    plane: Singles, x: float, y: float, c: Singles, s: Singles, t: float, out: Singles
 ) -> None:
     """Raise values to the heights at a distance from a point, all in pixels of the height map."""
     height, width = np.int32(plane.shape[0]), np.int32(plane.shape[1])
@@ -43,7 +43,7 @@ def _raise(
 
 
 @borrower
-def rises(height: Plane, shape: Shape, c: Singles, s: Singles, scratch: Plane) -> None:
+def rises(height: Singles, shape: Floats, c: Singles, s: Singles, scratch: Singles) -> None:
     """Write by how much (m) the highest point just outside an outline lies over its inside.
 
     Negative where everything outside is lower; 0 where nothing is known.

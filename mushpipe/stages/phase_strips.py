@@ -11,8 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mushpipe.core.arrays import Floats, Ints32, Singles
 from mushpipe.core.jit import borrower, inlined, jit
-from mushpipe.stages.phase_edges import Edges, Plane, Rows, Shape, Singles
+from mushpipe.stages.phase_edges import Edges
 from mushpipe.stages.phase_scratch import Scratch
 from mushpipe.stages.phase_steps import rises
 
@@ -51,13 +52,13 @@ class Strips(NamedTuple):
     nx: Singles
     ny: Singles
     weight: Singles
-    starts: Rows
+    starts: Ints32
     height: int
     width: int
 
 
 @jit
-def _sort(points: Plane, height: int, width: int) -> tuple[Plane, Rows]:
+def _sort(points: Singles, height: int, width: int) -> tuple[Singles, Ints32]:
     """Return points (C, M), x and y first, by strip and column, and where each column begins."""
     count = points.shape[1]
     starts = np.zeros((height // STRIP + 1) * width + 1, np.int32)
@@ -94,7 +95,7 @@ def _sector(dx: float, dy: float) -> int:
 
 @borrower
 def _uncovered(
-    edges: Strips, height: Plane, step: float, shape: Shape, count: int, scratch: Scratch
+    edges: Strips, height: Singles, step: float, shape: Floats, count: int, scratch: Scratch
 ) -> int:
     """Keep the rows of points in whose sector nothing stands higher; return their number."""
     rows, up, kept = scratch.rows, scratch.lanes[:, :AROUND], 0
@@ -112,7 +113,7 @@ def _uncovered(
 
 
 @borrower
-def _strips(edges: Strips, shape: Shape, outer: float) -> tuple[int, int]:
+def _strips(edges: Strips, shape: Floats, outer: float) -> tuple[int, int]:
     """Return the strips, from and up to, that a circle around an outline's centre crosses.
 
     Points beyond the image are in the strips and columns at its border, and so is such a circle.
@@ -123,7 +124,7 @@ def _strips(edges: Strips, shape: Shape, outer: float) -> tuple[int, int]:
 
 
 @borrower
-def _span(edges: Strips, shape: Shape, outer: float, strip: int) -> tuple[int, int]:
+def _span(edges: Strips, shape: Floats, outer: float, strip: int) -> tuple[int, int]:
     """Return the rows, from and up to, of the points of a strip that may lie in such a circle."""
     above = strip * STRIP - shape[1] if strip > 0 else 0.0
     below = shape[1] - (strip + 1) * STRIP if (strip + 1) * STRIP < edges.height else 0.0
@@ -136,7 +137,7 @@ def _span(edges: Strips, shape: Shape, outer: float, strip: int) -> tuple[int, i
 
 
 @borrower
-def _single(shape: Shape) -> tuple[Single, Single, Single, Single, Single]:
+def _single(shape: Floats) -> tuple[Single, Single, Single, Single, Single]:
     """Return an outline in single precision, in which SIMD does twice as much."""
     x, y, r = np.float32(shape[0]), np.float32(shape[1]), np.float32(shape[2])
     return x, y, r, np.float32(shape[3]), np.float32(shape[4])
@@ -164,7 +165,7 @@ def _seen(
 
 
 @borrower
-def _around(edges: Strips, low: int, shape: Shape, reach: float, near: Rows) -> None:
+def _around(edges: Strips, low: int, shape: Floats, reach: float, near: Ints32) -> None:
     """Write if the points from a row on lie within `reach` of an outline and face its centre."""
     outline, square, far = _single(shape), np.float32(TURNED**2), np.float32(reach)
     for i in range(len(near)):
@@ -174,7 +175,7 @@ def _around(edges: Strips, low: int, shape: Shape, reach: float, near: Rows) -> 
 
 @borrower
 def gather(
-    edges: Strips, height: Plane, step: float, shape: Shape, reach: float, scratch: Scratch
+    edges: Strips, height: Singles, step: float, shape: Floats, reach: float, scratch: Scratch
 ) -> int:
     """Write which edge points around an outline face its centre to `scratch.rows`; return how many.
 
@@ -218,7 +219,7 @@ def _turn(dx: Single, dy: Single) -> Single:
 
 @borrower
 def _beside(
-    edges: Strips, low: int, shape: Shape, near: float, n: int, at: Rows, off: Rows
+    edges: Strips, low: int, shape: Floats, near: float, n: int, at: Ints32, off: Ints32
 ) -> None:
     """Write at which of n directions the points from a row on support an outline, -1 for none.
 
@@ -245,7 +246,7 @@ def _beside(
 
 @borrower
 def outline_hits(
-    edges: Strips, shape: Shape, near: float, n: int, hits: Rows, scratch: Scratch
+    edges: Strips, shape: Floats, near: float, n: int, hits: Ints32, scratch: Scratch
 ) -> tuple[int, float]:
     """Write per direction the row of the nearest edge point that supports the outline, else -1.
 

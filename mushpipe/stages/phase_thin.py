@@ -5,19 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Bytes, Ints32, Singles
 from mushpipe.core.jit import borrower, inlined, jit
-
-Plane = NDArray[np.float32]
-Singles = NDArray[np.float32]
-Rows = NDArray[np.int32]
 
 
 @borrower
 def _ridge(
     above: Singles, here: Singles, below: Singles, gx: Singles, gy: Singles,
-    region: NDArray[np.uint8], threshold: float, maybe: NDArray[np.uint8],
+    region: Bytes, threshold: float, maybe: Bytes,
 ) -> None:  # fmt: skip
     """Write where in a row a maximum along the gradient may lie: not on slopes that go on.
 
@@ -55,7 +51,7 @@ def _bilinear(flat: Singles, first: Any, width: Any, fx: Any, fy: Any) -> Any:
 
 @borrower
 def _across(
-    size: Plane, y: int, columns: Rows, gx: Singles, gy: Singles, count: int, found: Plane
+    size: Singles, y: int, columns: Ints32, gx: Singles, gy: Singles, count: int, found: Singles
 ) -> None:
     """Write unit normals and the magnitudes one pixel along them and back, of pixels of a row.
 
@@ -86,13 +82,13 @@ def _across(
 
 @jit
 def thin(
-    gx: Plane,
-    gy: Plane,
-    size: Plane,
-    region: NDArray[np.uint8],
+    gx: Singles,
+    gy: Singles,
+    size: Singles,
+    region: Bytes,
     threshold: float,
-    points: Plane,
-    index: Rows,
+    points: Singles,
+    index: Ints32,
 ) -> int:
     """Write the maxima of the gradient along its direction, within a region, into `points`.
 

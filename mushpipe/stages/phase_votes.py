@@ -17,10 +17,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.jit import borrower, jit
-from mushpipe.stages.phase_edges import Plane, Singles
 from mushpipe.stages.phase_strips import Strips
 
 CELL = 2  # px; the accumulator has half the resolution of the image
@@ -50,7 +49,7 @@ def centres(
     shape: tuple[int, int],
     least: float,
     every: int = 1,
-) -> Plane:
+) -> Singles:
     """Return likely circles (N, 4): x, y, radius in px, and the share of the outline that voted.
 
     Args:
@@ -86,16 +85,14 @@ def rings_between(smallest: float, largest: float) -> Rings:
     return Rings(*(part.astype(np.float32) for part in parts))
 
 
-def phase_of(radius: NDArray[np.float64], smallest: float, largest: float) -> NDArray[np.float64]:
+def phase_of(radius: Floats, smallest: float, largest: float) -> Floats:
     """Return the phase of each radius."""
     share = np.log(radius / smallest) / math.log(max(largest / smallest, 1.001))
     return np.asarray((1 - GAP) * (2 * np.pi * share - np.pi))
 
 
 @jit
-def vote(
-    edges: Strips, rings: Rings, shape: tuple[int, int], every: int = 1
-) -> NDArray[np.float32]:
+def vote(edges: Strips, rings: Rings, shape: tuple[int, int], every: int = 1) -> Singles:
     """Return the accumulator (h, w, 2), real and imaginary part per cell.
 
     Only each `every`-th edge point votes, with the weight of so many.
@@ -119,7 +116,7 @@ def vote(
 
 
 @jit
-def summed(cells: NDArray[np.float32]) -> tuple[NDArray[np.float32], Plane]:
+def summed(cells: Singles) -> tuple[Singles, Singles]:
     """Return the sums over 3 x 3 cells (h, w, 2) and their magnitude (h, w); 0 at the border."""
     height, width, _ = cells.shape
     total = np.zeros_like(cells)
@@ -138,7 +135,7 @@ def summed(cells: NDArray[np.float32]) -> tuple[NDArray[np.float32], Plane]:
 
 
 @borrower
-def highest_around(size: Plane, x: int, y: int, reach: int) -> bool:
+def highest_around(size: Singles, x: int, y: int, reach: int) -> bool:
     """Whether no value within `reach` is higher; of equal ones the first row, then column, is."""
     value = size[y, x]
     for v in range(max(y - reach, 0), min(y + reach + 1, size.shape[0])):
@@ -159,9 +156,9 @@ def _vertex(before: float, at: float, behind: float) -> float:
 
 @jit
 def peaks(
-    total: NDArray[np.float32], size: Plane, least: float, smallest: float, largest: float,
+    total: Singles, size: Singles, least: float, smallest: float, largest: float,
     reach: int,
-) -> Plane:  # fmt: skip
+) -> Singles:  # fmt: skip
     """Return (N, 4): x, y, radius in px and magnitude of the local maxima of at least `least`.
 
     A maximum is the highest of the (2 reach + 1)^2 cells around it; its place is the vertex of

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, field_validator
 
 from mushpipe import Circles, DepthSource, Locations, PickFlag, Picks, Poses, RgbdFrame, Stage
+from mushpipe.core.arrays import Floats, Ints, Rows
 from mushpipe.core.errors import UsageError
 from mushpipe.core.transform import Transform, TransformSetting
 from mushpipe.stages.plausible import require_plausible
@@ -166,7 +167,7 @@ class MakePicks(Stage):
         circles: Circles,
         locations: Locations,
         poses: Poses,
-        hidden: NDArray[np.float64],
+        hidden: Floats,
     ) -> NDArray[np.uint32]:
         reach, tilt_sigma = circles.radius[:, None], np.radians(self.tilt_sigma_deg)
         cut = (circles.center < reach) | (circles.center + reach > np.array(image) - 1)
@@ -186,16 +187,14 @@ class MakePicks(Stage):
             flags[where] |= np.uint32(flag)
         return flags
 
-    def _above(self, locations: Locations) -> NDArray[np.float64]:
+    def _above(self, locations: Locations) -> Floats:
         """Return where positions (N, 2), m, lie seen from above: along the robot's z if known."""
         place = locations.position
         if self.T_base_camera is not None:
             place = self.T_base_camera.points(place)
         return place[:, :2]
 
-    def _chosen(
-        self, picks: Picks, up: NDArray[np.float64], hidden: NDArray[np.float64]
-    ) -> NDArray[np.intp]:
+    def _chosen(self, picks: Picks, up: Floats, hidden: Floats) -> Rows:
         """Return the rows that are given, the first to pick first; without depth comes last."""
         unwanted = reduce(operator.or_, (PickFlag[name.upper()] for name in self.withhold), 0)
         keep = (picks.score >= self.min_score) & ((picks.flags & np.uint32(unwanted)) == 0)
@@ -230,7 +229,7 @@ class MakePicks(Stage):
             )
 
 
-def _sigma_position(picks: Picks) -> NDArray[np.float64]:
+def _sigma_position(picks: Picks) -> Floats:
     """Return the sigma (N, 3), m, of the apex where there is a pose, of the surface point else.
 
     The picks come with that of the surface point, in the frame in which they are given. A cap that
@@ -246,7 +245,7 @@ def _sigma_position(picks: Picks) -> NDArray[np.float64]:
 
 
 def _joined(
-    ids: NDArray[np.int64],
+    ids: Ints,
     circles: Circles,
     locations: Locations,
     poses: Poses,

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mushpipe import RgbdFrame
+from mushpipe.core.arrays import Bools
 from mushpipe.core.types import end_of_scale
 from mushpipe.stages.linear import least_squares
 
@@ -13,7 +13,7 @@ _STEP = 8
 _FEWEST = 50
 
 
-def rise(frame: RgbdFrame, region: NDArray[np.bool_]) -> float:
+def rise(frame: RgbdFrame, region: Bools) -> float:
     """Return by how many metres a region stands above the rest; NaN where depth cannot tell.
 
     Least squares of inverse depth on 1, u, v and membership, from every eighth pixel each way: in

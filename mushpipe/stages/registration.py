@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr
 
 from mushpipe import (
@@ -18,6 +17,7 @@ from mushpipe import (
     Stage,
     quaternion_from_axis,
 )
+from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.libraries import import_open3d
 from mushpipe.stages.calibrated import calibration_of
 from mushpipe.stages.discs import radii_on_rays
@@ -25,7 +25,6 @@ from mushpipe.stages.upright import Up, pixel_rays, upright
 from mushpipe.stages.upright_model import Model, made, read
 from mushpipe.stages.warm_up import CAMERA, example_frame
 
-Floats = NDArray[np.float64]
 _FARTHEST = 1.0  # radii; ICP slides along a smooth cap, and off it where its error is along normals
 _LEAST_FITNESS = 0.2  # share of the model; half of it faces away from the camera
 
@@ -242,8 +241,8 @@ def _cloud(o3d: Any, points: Floats, normals: Floats | None) -> Any:
 
 
 def _inside(
-    depth: NDArray[np.float32],
-    rays: NDArray[np.float32],
+    depth: Singles,
+    rays: Singles,
     center: Floats,
     radius: float,
     size: float,

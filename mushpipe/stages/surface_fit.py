@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from mushpipe import Camera, Circles, DepthSource, Locations, RgbdFrame, Stage
+from mushpipe.core.arrays import Bytes, Floats, Ints, Rows, Singles
 from mushpipe.core.geometry import lengths
 from mushpipe.core.jit import borrower
 from mushpipe.stages.calibrated import calibration_of
@@ -18,7 +18,6 @@ from mushpipe.stages.paraboloid import ASPECT, COEFFICIENTS, SHAPE_M, TIP, fit_s
 from mushpipe.stages.upright import pixel_rays
 from mushpipe.stages.warm_up import example_circles, example_frame
 
-Floats = NDArray[np.float64]
 ASPECT_SIGMA = 0.2  # as in cap-fit
 LIP = 0.25  # what is below the rim's plane, over its radius
 OUTLINE = 0.008  # sigma of a cap's diameter about that of its outline, relative
@@ -87,14 +86,14 @@ class SurfaceFit(Stage):
 
 
 def fit_tops(
-    depth: NDArray[np.float32],
+    depth: Singles,
     camera: Camera,
     discs: Floats,
     noise: tuple[float, float],
     least: int,
-    rows: NDArray[np.intp] | None = None,
+    rows: Rows | None = None,
     order: Order | None = None,
-) -> tuple[Floats, Floats, NDArray[np.int64]]:
+) -> tuple[Floats, Floats, Ints]:
     """Return coefficients (M, 7), m, covariances (M, 7, 7) and numbers of points (M, 2).
 
     A circle without a fit has NaN.
@@ -142,7 +141,7 @@ def variance_along(surface: Floats, covariance: Floats, size: Floats, pixel: Flo
     return np.asarray(covariance[:, 0, 0] + SHAPE_M**2 + (slope**2).sum(axis=1) * pixel**2)
 
 
-def sources(circles: Circles, depth: NDArray[np.float32]) -> NDArray[np.uint8]:
+def sources(circles: Circles, depth: Singles) -> Bytes:
     """Return where the depth at the centres (N,) comes from: from there, or from around it."""
     found = np.full(len(circles), DepthSource.NEIGHBOURS, np.uint8)
     _mark_measured(circles.center, depth, int(DepthSource.MEASURED), found)
@@ -150,9 +149,7 @@ def sources(circles: Circles, depth: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 @borrower
-def _mark_measured(
-    center: Floats, depth: NDArray[np.float32], mark: int, found: NDArray[np.uint8]
-) -> None:
+def _mark_measured(center: Floats, depth: Singles, mark: int, found: Bytes) -> None:
     """Write a mark (N,) for each centre (N, 2), px, at which there is depth (H, W)."""
     for i in range(len(center)):
         u, v = np.rint(center[i, 0]), np.rint(center[i, 1])

@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
+from mushpipe.core.arrays import Floats, Ints
 from mushpipe.core.jit import jit
-from mushpipe.core.tables import Circles, Floats, Locations
+from mushpipe.core.tables import Circles, Locations
 from mushpipe.stages.cap_order import paint
 from mushpipe.stages.discs import discs_of
 
@@ -31,7 +32,7 @@ def hidden_share(circles: Circles, distance: Floats, image: tuple[int, int]) -> 
 
 
 @jit
-def covered(ranks: NDArray[np.int16], discs: Floats, rank: NDArray[np.int64]) -> Floats:
+def covered(ranks: NDArray[np.int16], discs: Floats, rank: Ints) -> Floats:
     """Return the share (N,) of each disc's pixels that bear a lower rank than its own.
 
     Args:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-from mushpipe.core.tables import Circles, Columns, Floats, Locations, column
+from mushpipe.core.arrays import Floats, Ints, Rows
+from mushpipe.core.tables import Circles, Columns, Locations, column
 
 GATE = 0.5  # farthest that a mushroom may be from where it is expected, in radii
 NEAR = 0.4  # gates, root mean square; of those that come there by chance it is 0.7
@@ -31,8 +31,8 @@ class Sightings(Columns):
         size: (N,) m, radius; NaN where unknown.
     """
 
-    id: NDArray[np.int64] = column(dtype=np.int64)
-    seen_ns: NDArray[np.int64] = column(dtype=np.int64)
+    id: Ints = column(dtype=np.int64)
+    seen_ns: Ints = column(dtype=np.int64)
     center: Floats = column(2)
     radius: Floats = column()
     position: Floats = column(3)
@@ -59,7 +59,7 @@ class Tracks:
         image: tuple[int, int],
         stamp_ns: int,
         memory_ns: int,
-    ) -> NDArray[np.int64]:
+    ) -> Ints:
         """Return an id (N,) per mushroom; one unseen for longer than the memory is forgotten.
 
         Args:
@@ -120,7 +120,7 @@ def _gates(new: Floats, old: Floats) -> Floats:
     return GATE * np.minimum(new[:, None], old[None])
 
 
-def _assign(distances: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _assign(distances: Floats) -> tuple[Rows, Rows]:
     """Return the rows and columns of the pairs: as many as there can be, as near as can be."""
     # A pair outside its gate costs more than any number of pairs inside theirs.
     cost = np.where(distances <= 1, distances, 1e6)

@@ -6,14 +6,13 @@ from functools import lru_cache
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
 from mushpipe import Camera
+from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.jit import borrower
 from mushpipe.stages.bed import CELL, far_cells, fit_plane
 
-Floats = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 
@@ -32,7 +31,7 @@ Up = Annotated[
 ]
 
 
-def bed_normal(depth: NDArray[np.float32], rays: NDArray[np.float32]) -> Floats | None:
+def bed_normal(depth: Singles, rays: Singles) -> Floats | None:
     """Fit a plane to the bed and return its unit normal (3,), towards the camera.
 
     A plane a X + b Y + c Z = 1 seen along the ray (x, y, 1) is 1/z = a x + b y + c.
@@ -54,7 +53,7 @@ def bed_normal(depth: NDArray[np.float32], rays: NDArray[np.float32]) -> Floats 
 
 
 @borrower
-def _look(far: Floats, rays: NDArray[np.float32]) -> None:
+def _look(far: Floats, rays: Singles) -> None:
     """Put the rays of cells (rows, columns, 3) in the place of their pixels; NaN without one."""
     for i in range(far.shape[0]):
         for j in range(far.shape[1]):
@@ -65,7 +64,7 @@ def _look(far: Floats, rays: NDArray[np.float32]) -> None:
 
 
 @lru_cache(maxsize=4)
-def pixel_rays(camera: Camera) -> NDArray[np.float32]:
+def pixel_rays(camera: Camera) -> Singles:
     """Return the rays (H, W, 2) of all pixels at z = 1; beyond 1e3 where the lens has none."""
     v, u = np.mgrid[: camera.height, : camera.width]
     points = camera.deproject(np.stack([u, v], axis=-1), np.ones(u.shape))[..., :2]
@@ -74,7 +73,7 @@ def pixel_rays(camera: Camera) -> NDArray[np.float32]:
     return rays
 
 
-def upright(up: Up, depth: NDArray[np.float32], rays: NDArray[np.float32]) -> Floats:
+def upright(up: Up, depth: Singles, rays: Singles) -> Floats:
     """Return which way is up, a unit vector (3,) in the optical frame.
 
     Args:

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mushpipe import InputError
+from mushpipe.core.arrays import Floats
 from mushpipe.core.libraries import import_open3d
 
-Floats = NDArray[np.float64]
 ASPECT, LIP, STEM, STEM_LENGTH = 0.62, 0.2, 0.4, 1.4  # in rim radii
 
 

@@ -11,11 +11,10 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Floats
 from mushpipe.core.errors import UsageError
 
-Floats = NDArray[np.float64]
 COLUMNS = ("mean", "scale", "weight", "square")
 LIMIT = 4.0  # of a standardised feature: beyond the scenes of the training it says no more
 _EXPECTED = "expected a file as `make verifier` writes it"

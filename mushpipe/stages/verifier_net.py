@@ -14,11 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.errors import UsageError
 from mushpipe.core.jit import borrower
 
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
 LIMIT = 2.5  # of a standardised feature: beyond the scenes of the training it says no more
 WIDTHS = (32, 16)  # of the two hidden layers
 _EXPECTED = "expected a file as `make verifier` writes it"

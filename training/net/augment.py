@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Bools, Floats, Singles
 from mushpipe.core.truth import Ignore
 from mushpipe.stages.cap_decode import CHANNELS, HEAT, MASK, OFFSET, RADIUS, STRIDE
 from training.net.scenes import Picture
-from training.net.texture import NOISE, Floats, Singles, textured
+from training.net.texture import NOISE, textured
 
 SMALLEST = 5.0  # px; smaller outlines are not asked for
 HIDDEN = 0.3  # nor are those of which less is seen
@@ -53,7 +53,7 @@ def crop(
 
 def _placement(
     picture: Picture, size: int, rng: np.random.Generator, near: float
-) -> tuple[NDArray[np.float64], float]:
+) -> tuple[Floats, float]:
     """Draw an affine map (2, 3) of the frame onto the crop, and its scale."""
     scale = float(np.exp(rng.uniform(np.log(0.5), np.log(2.2))))
     turn = rng.uniform(-np.pi, np.pi)
@@ -70,9 +70,7 @@ def _placement(
     return np.column_stack([linear, size / 2 - linear @ middle]), scale
 
 
-def aims(
-    circles: NDArray[np.float64], unsure: NDArray[np.bool_], cells: int
-) -> tuple[Singles, Singles]:
+def aims(circles: Floats, unsure: Bools, cells: int) -> tuple[Singles, Singles]:
     """Return target (5, h, w), its mask still empty, and weight (h, w) of circles (N, 3) px.
 
     Heat is a Gaussian of a sixth of the diameter, cut at 1 in the cell of the centre.

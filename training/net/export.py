@@ -14,6 +14,7 @@ import onnx
 import torch
 
 from mushpipe import Circles, RgbdFrame
+from mushpipe.core.arrays import Floats
 from mushpipe.core.truth import Ignore
 from mushpipe.core.types import Header
 from mushpipe.evaluate.matching import circle_iou
@@ -23,7 +24,6 @@ from mushpipe.stages.cap_net import CapNet as Stage
 from training.matching import IOU
 from training.net.model import CapNet
 from training.net.scenes import VALIDATION, VALIDATION_SEED, Picture, pictures
-from training.verifier import Floats
 
 RADII = (8.0, 45.0)
 

@@ -13,13 +13,12 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Bools, Bytes, Floats
 from mushpipe.core.truth import INSTANCES_TOPIC, TRUTH_TOPIC, Ignore, Instances, Truth
 from mushpipe.sources.synthetic import SyntheticSource
 from training.scenes import Case, stored
 
-Floats = NDArray[np.float64]
 TRAINING_SEED, VALIDATION_SEED, JUDGING_SEED = 200_000, 300_000, 400_000
 VERIFIER_SEED, CHOOSING_SEED = 500_000, 510_000  # family a
 TRAINING, VALIDATION = 640, 60
@@ -37,10 +36,10 @@ class Picture:
         visible: (N,) 0..1.
     """
 
-    color: NDArray[np.uint8]
-    cap: NDArray[np.bool_]
+    color: Bytes
+    cap: Bools
     circles: Floats
-    kind: NDArray[np.uint8]
+    kind: Bytes
     visible: Floats
 
 
@@ -129,7 +128,7 @@ def _render(seed: int, path: Path) -> None:
     part.rename(path)
 
 
-def cap_mask(truth: Truth, instances: Instances) -> NDArray[np.bool_]:
+def cap_mask(truth: Truth, instances: Instances) -> Bools:
     """Return the pixels (H, W) of caps; those of cut stumps are none."""
     return np.append(False, truth.ignore != Ignore.CUT_STUMP)[instances.labels]
 

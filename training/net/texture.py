@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
+from mushpipe.core.arrays import Floats, Singles
+
 # Noise is a stretch of this: to draw it anew took a sixth of a crop's time.
 NOISE = np.random.default_rng(0).standard_normal(2_000_000, np.float32)
 

@@ -18,10 +18,10 @@ import torch
 from torch import nn
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
+from mushpipe.core.arrays import Singles
 from training.net.augment import crop
 from training.net.model import CapNet, loss_of
 from training.net.scenes import TRAINING, TRAINING_SEED, Picture, pictures
-from training.net.texture import Singles
 
 SIZE, BATCH, RATE, DECAY = 224, 8, 2.5e-3, 0.998
 NEAR = 0.3  # share of the crops that are taken around a cap
