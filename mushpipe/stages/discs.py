@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,6 +14,19 @@ from mushpipe.core.tables import Circles
 
 # Radii are no more exact than a tenth: by so much an outline may be beyond a range of radii.
 LEAST_OF_RANGE, MOST_OF_RANGE = 0.9, 1.1
+
+
+class Radii(NamedTuple):
+    """A range of radii, px."""
+
+    smallest: float
+    largest: float
+
+
+@borrower
+def within(radius: float, radii: Radii) -> bool:
+    """Whether a radius (px) is within the range, or a tenth beyond."""
+    return radii.smallest * LEAST_OF_RANGE <= radius <= radii.largest * MOST_OF_RANGE
 
 
 def discs_of(circles: Circles) -> Floats:

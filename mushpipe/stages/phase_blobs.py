@@ -15,26 +15,26 @@ import numpy as np
 
 from mushpipe.core.arrays import Singles
 from mushpipe.core.jit import borrower, jit
+from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE, Radii
 from mushpipe.stages.phase_depth import CELL, Relief
 from mushpipe.stages.phase_votes import highest_around
 
 LEVELS = (0.01, 0.014, 0.02, 0.028, 0.035, 0.05)  # m over the bed
 STEP = 2  # px of the height map; a start for a refit need not be more exact
-REACH = 2  # steps around a peak within which it must be the highest
 FREE = 0.55  # share of the ring around a disc that is lower, for it to be a thing of its own
 RING = 1.25  # radius of that ring, of the disc's
 _TURNS = 2 * np.pi * np.arange(16) / 16
 _COSINES, _SINES = np.cos(_TURNS), np.sin(_TURNS)
 
 
-def blobs_of(relief: Relief, smallest: float, largest: float) -> Singles:
+def blobs_of(relief: Relief, radii: Radii) -> Singles:
     """Return the discs of a radius (px) in the range that stand free, as candidates (N, 4)."""
     height, pixel = relief.filled[::STEP, ::STEP], CELL * STEP
+    limits = Radii(LEAST_OF_RANGE * radii.smallest / pixel, MOST_OF_RANGE * radii.largest / pixel)
     found = [np.zeros((0, 4), np.float32)]
     for level in LEVELS:
         standing = (height > level).astype(np.uint8)
         away = cv2.distanceTransform(standing, cv2.DIST_L2, cv2.DIST_MASK_5)
-        limits = (0.9 * smallest / pixel, 1.1 * largest / pixel)
         found.append(_discs(np.asarray(away, np.float32), pixel, limits))
     return _distinct(np.concatenate(found))
 
@@ -55,13 +55,13 @@ def _distinct(discs: Singles) -> Singles:
 
 
 @jit
-def _discs(away: Singles, pixel: int, limits: tuple[float, float]) -> Singles:
+def _discs(away: Singles, pixel: int, limits: Radii) -> Singles:
     height, width = away.shape
     found, count = np.empty((away.size // 4 + 1, 4), np.float32), 0
     for v in range(height):
         for u in range(width):
             r = away[v, u]
-            if r < limits[0] or r > limits[1] or not highest_around(away, u, v, REACH):
+            if r < limits.smallest or r > limits.largest or not highest_around(away, u, v):
                 continue
             x, y = pixel * (u + 0.5) - 0.5, pixel * (v + 0.5) - 0.5
             if _free(away, u, v):

@@ -17,9 +17,9 @@ from mushpipe.core.arrays import Bools, Floats, Ints32, Singles
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.discs import lens
 from mushpipe.stages.phase_features import AT_LEARNED
-from mushpipe.stages.phase_refit import COSINES, HIDDEN, NARROW, SINES, around, tolerance
+from mushpipe.stages.phase_refit import COSINES, HIDDEN, NARROW, SINES, reach_of, tolerance
 from mushpipe.stages.phase_scratch import Scratch, scratch_for
-from mushpipe.stages.phase_strips import Strips
+from mushpipe.stages.phase_strips import Strips, gather
 from mushpipe.stages.verifier_net import Models, probability
 
 MARGIN = 1.0  # px; so far within an accepted circle an outline counts as hidden by it
@@ -107,7 +107,7 @@ def chance_beside(
 @borrower
 def _use_up(edges: Strips, shape: Floats, number: int, owner: Ints32, scratch: Scratch) -> None:
     rows, nothing = scratch.rows, scratch.lanes[:0]
-    count = around(edges, nothing, 0.0, shape, NARROW, scratch)
+    count = gather(edges, nothing, 0.0, shape, reach_of(shape[2], NARROW), scratch)
     near = max(TAKEN, 1.3 * tolerance(shape[2]))
     for k in range(count):
         dx, dy = edges.x[rows[k]] - shape[0], edges.y[rows[k]] - shape[1]

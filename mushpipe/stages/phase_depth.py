@@ -5,7 +5,7 @@ The bed is a plane here (see `bed`).
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,23 +95,27 @@ def closed(height: Singles) -> Singles:
     return out
 
 
-class Relief:
+class Relief(NamedTuple):
     """The height of what stands on the bed.
 
     Attributes:
-        height: (h, w) m over the bed at half resolution, -1 where unknown.
+        height: (h, w) m over the bed at half resolution, -1 where unknown; empty without depth.
         filled: (h, w) m, the same with narrow gaps `closed`.
-        depth: (h, w) m, -1 where unknown.
         plane: (3,) of the bed at half resolution, from `fit_plane`.
         focal: px of the full image.
         pixel: Size of a pixel of the full image on the bed, m, in the middle of what is seen.
     """
 
-    def __init__(self, depth: Singles, height: Singles, plane: Floats, focal: float) -> None:
-        self.depth, self.height, self.plane, self.focal = depth, height, plane, focal
-        self.filled = closed(height)
-        known = depth[depth > 0]
-        self.pixel = float(np.median(known[:: max(1, len(known) // 2000)])) / focal
+    height: Singles
+    filled: Singles
+    plane: Floats
+    focal: float
+    pixel: float
+
+    @property
+    def known(self) -> bool:
+        """Whether there is depth."""
+        return len(self.height) > 0
 
     def bed_pixel(self, x: Any, y: Any) -> Floats:
         """Return the size, m, of a pixel of the full image on the bed at x, y (px)."""
@@ -128,15 +132,19 @@ class Relief:
         return Edges(*(column[real] for column in edges))
 
 
-def relief_of(frame: RgbdFrame) -> Relief | None:
-    """Return the relief of a frame; None without depth, calibration, or enough of a bed."""
+_NOTHING = np.zeros((0, 0), np.float32)
+NO_RELIEF = Relief(_NOTHING, _NOTHING, np.zeros(3), focal=0.0, pixel=0.0)
+
+
+def relief_of(frame: RgbdFrame) -> Relief:
+    """Return the relief of a frame; none without depth, calibration, or enough of a bed."""
     if frame.depth is None or frame.camera is None or min(frame.depth.shape) < 2 * GRID:
-        return None
+        return NO_RELIEF
     depth = halved(frame.depth, frame.depth_scale)
     plane = fit_plane(far_cells(depth, GRID))
     if plane is None:
-        return None
-    return Relief(depth, _heights(depth, plane), plane, (frame.camera.fx + frame.camera.fy) / 2)
-
-
-NO_RELIEF = np.zeros((0, 0), np.float32)
+        return NO_RELIEF
+    height, focal = _heights(depth, plane), (frame.camera.fx + frame.camera.fy) / 2
+    known = depth[depth > 0]
+    pixel = float(np.median(known[:: max(1, len(known) // 2000)])) / focal
+    return Relief(height, closed(height), plane, focal, pixel)

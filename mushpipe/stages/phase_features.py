@@ -7,19 +7,18 @@ Features of the image, then features that need depth. `free`, `support`, `trust`
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from mushpipe.core.arrays import Bytes, Floats, Ints32, Singles
 from mushpipe.core.jit import borrower
 from mushpipe.stages.linear import solve
+from mushpipe.stages.phase_depth import Relief
 from mushpipe.stages.phase_edges import Gradient
 from mushpipe.stages.phase_refit import COSINES, HIDDEN, SINES
 from mushpipe.stages.phase_scratch import DIRECTIONS
 from mushpipe.stages.phase_steps import height_at, rises, step_up
-
-# heights and weights (P,), normal matrix (6, 6) and its right side, and (2, DIRECTIONS)
-Room = tuple[Floats, Floats, Floats, Floats, Singles]
 
 # How bright a cap is against what is beside it is none of them: simulated beds are fuller than real
 # ones, so a cap with dark soil all around it counted as less likely than one in a cluster.
@@ -49,7 +48,7 @@ DEPTH_FEATURES = {
 LEARNED = "learned"  # what circles of another detector say; see `phase_learned`
 NAMES = (*IMAGE_FEATURES, *DEPTH_FEATURES, LEARNED)
 AT_LEARNED = NAMES.index(LEARNED)
-FIRST_STATIC = list(NAMES).index("residual")
+FIRST_STATIC = NAMES.index("residual")
 FIRST_DEPTH = len(IMAGE_FEATURES)
 SAMPLES = 16  # directions in which the disc is sampled
 LEAST_KNOWN = 0.35  # share of the disc with depth below which depth features are off
@@ -64,6 +63,24 @@ _PRODUCTS = np.array([_BY_TERM[p] * _BY_TERM[q] for p in range(6) for q in range
 _RINGS = np.array([0.15, 0.3, 0.45, 0.6, 0.75, 0.88, 0.97])
 
 
+class Room(NamedTuple):
+    """Room to work in, made once for all outlines.
+
+    Attributes:
+        heights: (P,) m, of the points of a surface.
+        weights: (P,) of them.
+        normal: (6, 6) normal matrix.
+        right: (6,) its right side.
+        lanes: (2, DIRECTIONS) of whatever has a number per direction.
+    """
+
+    heights: Floats
+    weights: Floats
+    normal: Floats
+    right: Floats
+    lanes: Singles
+
+
 @borrower
 def _pixel(x: float, y: float, width: int, height: int) -> tuple[int, int]:
     """Nearest pixel; x = -1 beyond the image."""
@@ -74,10 +91,7 @@ def _pixel(x: float, y: float, width: int, height: int) -> tuple[int, int]:
 
 
 @borrower
-def disc_features(
-    image: Singles, gx: Singles, gy: Singles, size: Singles, mask: Bytes, shape: Floats,
-    rings: Floats, row: Floats,
-) -> None:  # fmt: skip
+def disc_features(image: Singles, grad: Gradient, mask: Bytes, shape: Floats, row: Floats) -> None:
     """Write cover, coherence and texture of a disc, sampled on a polar grid, into row[0..2].
 
     Samples count by the area they stand for.
@@ -86,16 +100,16 @@ def disc_features(
     area = set_area = inward = total = small = bright = small_area = 0.0
     for k in range(SAMPLES):
         c, s = _COSINES[k], _SINES[k]
-        for t in rings:
+        for t in _RINGS:
             u, v = _pixel(shape[0] + t * shape[2] * c, shape[1] + t * shape[2] * s, width, lines)
             if u < 0:
                 continue
             area += t
             set_area += t * mask[v, u]
-            inward -= t * (gx[v, u] * c + gy[v, u] * s)
-            total += t * size[v, u]
+            inward -= t * (grad.x[v, u] * c + grad.y[v, u] * s)
+            total += t * grad.size[v, u]
             if t < 0.7:
-                small += t * size[v, u]
+                small += t * grad.size[v, u]
                 bright += t * image[v, u]
                 small_area += t
     row[0] = set_area / max(area, 1e-9)
@@ -150,15 +164,12 @@ def _misfit(z: float, k: int, b: Floats) -> float:
 
 
 @borrower
-def surface_features(
-    height: Singles, shape: Floats, pixel: float, row: Floats, room: Room
-) -> float:
+def surface_features(relief: Relief, shape: Floats, row: Floats, room: Room) -> float:
     """Write height, bend_small, bend_large, roughness and gap into row[0..3] and row[6].
 
     Args:
-        height: (h, w) m at half resolution, -1 where unknown.
+        relief: What stands on the bed.
         shape: x, y, r, p, q.
-        pixel: Size of a pixel on the bed, m.
         row: Receives the features.
         room: To work in.
 
@@ -168,7 +179,7 @@ def surface_features(
     (z, weight, a, b, _), known = room, 0
     for k in range(len(z)):
         x, y = shape[0] + _BASIS[k, 1] * shape[2], shape[1] + _BASIS[k, 2] * shape[2]
-        z[k] = height_at(height, x, y)
+        z[k] = height_at(relief.height, x, y)
         known += z[k] != -1
     row[6] = 1 - known / len(z)
     if row[6] > 1 - LEAST_KNOWN or known < 8:
@@ -176,7 +187,7 @@ def surface_features(
     b[:] = 0.0
     rms = _quadric(z, math.inf, b, a, weight)
     rms = _quadric(z, max(0.001, rms), b, a, weight)
-    radius = shape[2] * pixel
+    radius = shape[2] * relief.pixel
     mean, spread = -(b[3] + b[5]), math.sqrt((b[3] - b[5]) ** 2 + b[4] ** 2)
     row[0] = b[0] / (abs(b[0]) + radius)
     row[1] = min(3.0, max(-2.0, (mean - spread) / radius))
@@ -186,16 +197,14 @@ def surface_features(
 
 
 @borrower
-def edge_features(
-    height: Singles, shape: Floats, pixel: float, hits: Ints32, row: Floats, lanes: Singles
-) -> None:
+def edge_features(relief: Relief, shape: Floats, hits: Ints32, row: Floats, lanes: Singles) -> None:
     """Write drop and rise into row[4], row[5]; mark directions of `hits` with a rise as hidden."""
-    step = step_up(shape[2] * pixel)
+    step = step_up(shape[2] * relief.pixel)
     n, known, lower, higher = 0, 0, 0, 0
     while n < len(hits) and hits[n] != -2:
         n += 1
     ups = lanes[:, :n]
-    rises(height, shape, COSINES[n, :n], SINES[n, :n], ups)
+    rises(relief.height, shape, COSINES[n, :n], SINES[n, :n], ups)
     for k in range(n):
         up = ups[0, k]
         if up == 0:
@@ -212,26 +221,24 @@ def edge_features(
 
 @borrower
 def _static(
-    image: Singles, gx: Singles, gy: Singles, size: Singles, mask: Bytes, height: Singles,
-    pixel: float, shapes: Floats, hits: Ints32, residual: Singles,
-    rings: Floats, table: Floats, middle: Floats, places: tuple[int, int], room: Room,
+    image: Singles, grad: Gradient, mask: Bytes, relief: Relief, shapes: Floats, hits: Ints32,
+    residual: Singles, table: Floats, middle: Floats, room: Room,
 ) -> None:  # fmt: skip
-    first, depth = places
     for k in range(len(shapes)):
         shape, row = shapes[k], table[k]
-        row[first] = residual[k] / shape[2]
-        row[first + 1] = math.hypot(shape[3], shape[4]) / shape[2]
-        disc_features(image, gx, gy, size, mask, shape, rings, row[first + 2 :])
+        row[FIRST_STATIC] = residual[k] / shape[2]
+        row[FIRST_STATIC + 1] = math.hypot(shape[3], shape[4]) / shape[2]
+        disc_features(image, grad, mask, shape, row[FIRST_STATIC + 2 :])
         middle[k] = math.nan
-        if len(height):
-            middle[k] = surface_features(height, shape, pixel, row[depth:], room)
+        if len(relief.height):
+            middle[k] = surface_features(relief, shape, row[FIRST_DEPTH:], room)
             if middle[k] == middle[k]:
-                edge_features(height, shape, pixel, hits[k], row[depth:], room[4])
+                edge_features(relief, shape, hits[k], row[FIRST_DEPTH:], room.lanes)
 
 
 def static_features(
-    image: Singles, grad: Gradient, mask: Bytes, height: Singles, pixel: float,
-    shapes: Floats, hits: Ints32, residual: Singles,
+    image: Singles, grad: Gradient, mask: Bytes, relief: Relief, shapes: Floats, hits: Ints32,
+    residual: Singles,
 ) -> tuple[Floats, Floats]:  # fmt: skip
     """Return all features that do not depend on other candidates, (N, F), and heights (N,) m.
 
@@ -241,18 +248,13 @@ def static_features(
         image: (H, W) gray levels.
         grad: Its gradient.
         mask: (H, W) 0 or 1.
-        height: (h, w) m at half resolution, -1 where unknown; empty without depth.
-        pixel: Size of a pixel on the bed, m.
+        relief: What stands on the bed.
         shapes: (N, 5) outlines.
         hits: (N, D) rows of the edges that support them; hidden directions are marked in it.
         residual: (N,) px.
     """
     table, middle = np.zeros((len(shapes), len(NAMES))), np.full(len(shapes), np.nan)
-    places = (FIRST_STATIC, FIRST_DEPTH)
-    room = (np.empty(len(_BASIS)), np.empty(len(_BASIS)), np.empty((6, 6)), np.empty(6))
-    lanes = np.empty((2, DIRECTIONS), np.float32)
-    _static(
-        image, *grad, mask, height, pixel, shapes, hits, residual, _RINGS, table, middle, places,
-        (*room, lanes),
-    )  # fmt: skip
+    points, lanes = np.empty((2, len(_BASIS))), np.empty((2, DIRECTIONS), np.float32)
+    room = Room(points[0], points[1], np.empty((6, 6)), np.empty(6), lanes)
+    _static(image, grad, mask, relief, shapes, hits, residual, table, middle, room)
     return table, middle

@@ -12,7 +12,7 @@ from pydantic import Field, PrivateAttr, model_validator
 from mushpipe import Circles, Mask, RgbdFrame, Stage, UsageError
 from mushpipe.core.arrays import Bools, Bytes, Floats, Ints32, Singles
 from mushpipe.core.paths import GraphPath
-from mushpipe.stages.discs import certain_first
+from mushpipe.stages.discs import Radii, certain_first
 from mushpipe.stages.doubling import doubled
 from mushpipe.stages.phase_blobs import blobs_of
 from mushpipe.stages.phase_decide import LIKELY, decide
@@ -25,8 +25,8 @@ from mushpipe.stages.phase_learned import (
     agreement,
     candidates_of,
     largest_of,
+    of_radii,
     with_bare,
-    within,
     without_clods,
 )
 from mushpipe.stages.phase_polish import polish
@@ -62,9 +62,8 @@ class Evidence:
         hits: (N, D) rows of the edges that support each.
         table: (N, F) features.
         middle: (N,) m height of the middle over the bed, NaN without depth.
-        height: (h, w) m over the bed at half resolution, empty without depth.
-        pixel: Size of a pixel on the bed, m.
-        range: Smallest and largest radius, px.
+        relief: What stands on the bed.
+        radii: That were looked for.
         learned: Circles of the network within the range; None without.
     """
 
@@ -73,9 +72,8 @@ class Evidence:
     hits: Ints32
     table: Floats
     middle: Floats
-    height: Singles
-    pixel: float
-    range: tuple[float, float]
+    relief: Relief
+    radii: Radii
     learned: Circles | None
 
 
@@ -158,18 +156,18 @@ class PhaseHough(Stage):
         if found is None:
             return Circles(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
         # Beside depth: an image alone places circles better than the network does.
-        order, chance, owner = self.decide(found, led=len(found.height) > 0)
+        order, chance, owner = self.decide(found, led=found.relief.known)
         shapes, score = found.shapes[order], chance[order]
         # What is hardly a cap changes nothing about those that are likely: it takes no edges from
         # them, and what is a cap only beside it is no more likely than it is.
         after = np.logical_or.accumulate(score < LIKELY)
         score[after] = np.minimum.accumulate(score[after])
         owner[np.isin(owner, np.flatnonzero(after))] = -1
-        polish(found.edges, found.height, found.pixel, shapes, owner, *found.range)
+        polish(found.edges, found.relief, shapes, owner, found.radii)
         circles = Circles(shapes[:, :2], equal_area_radius(shapes), score)
         if found.learned is None:
             return circles
-        if len(found.height):
+        if found.relief.known:
             unseen = found.table[order, AT_LEARNED] == 0
             return certain_first(without_clods(frame.color, circles, unseen))
         sure = found.learned.take(found.learned.score >= max(_SURE, self.min_score))
@@ -184,9 +182,9 @@ class PhaseHough(Stage):
         if min(height, width) < _SMALLEST:
             return None
         literal = self.input == "mask"
-        relief = relief_of(frame) if self.use_depth and not literal else None
-        smallest, largest = self._range(relief, learned, height, width)
-        if smallest >= largest:
+        relief = relief_of(frame) if self.use_depth and not literal else NO_RELIEF
+        radii = self._radii(relief, learned, height, width)
+        if radii.smallest >= radii.largest:
             return None
         image = np.asarray(mask.foreground if literal else frame.gray, np.float32) * np.float32(255)
         gradient = gradient_of(image)
@@ -196,27 +194,23 @@ class PhaseHough(Stage):
         foreground = _foreground(inside, relief)
         region = np.ones_like(foreground) if literal else cv2.dilate(foreground, _AROUND)
         edges = self._edges(image, gradient, np.asarray(region, np.uint8), relief)
-        every = 1 if learned is None or relief is None else _EVERY
+        every = _EVERY if learned is not None and relief.known else 1
         evidence = self.evidence or (EVIDENCE if learned is None else _BESIDE)
-        found = centres(edges, (smallest, largest), (height, width), evidence, every)
-        known = None if learned is None else within(learned, smallest, largest)
+        found = centres(edges, radii, (height, width), evidence, every)
+        known = None if learned is None else of_radii(learned, radii)
         if known is not None:
             found = np.concatenate([found, candidates_of(known)])
-        if relief is not None and self.use_blobs:
-            found = np.concatenate([found, blobs_of(relief, smallest, largest)])
-        high, pixel = (relief.height, relief.pixel) if relief else (NO_RELIEF, 0.0)
-        shapes, hits, residual = refit(edges, high, pixel, found, smallest, largest)
-        table, middle = static_features(
-            image, gradient, inside, high, pixel, shapes, hits, residual
-        )
+        if relief.known and self.use_blobs:
+            found = np.concatenate([found, blobs_of(relief, radii)])
+        shapes, hits, residual = refit(edges, relief, found, radii)
+        table, middle = static_features(image, gradient, inside, relief, shapes, hits, residual)
         if learned is not None:
             table[:, AT_LEARNED] = agreement(shapes, equal_area_radius(shapes), learned)
         kept = self._plausible(shapes, middle, relief)
         if learned is not None:
             kept &= np.isfinite(middle) | (table[:, AT_LEARNED] >= _SEEN)
-        limits = (smallest, largest)
         parts = (shapes[kept], hits[kept], table[kept], middle[kept])
-        return Evidence(edges, *parts, high, pixel, limits, known)
+        return Evidence(edges, *parts, relief, radii, known)
 
     def decide(self, found: Evidence, led: bool = False) -> tuple[Ints32, Floats, Ints32]:
         """Return the accepted rows in their order, all probabilities, and whose each edge is.
@@ -235,41 +229,36 @@ class PhaseHough(Stage):
             self._models = load_verifier(self.verifier, self.input == "mask")
         return self._models
 
-    def _range(
-        self, relief: Relief | None, learned: Circles | None, height: int, width: int
-    ) -> tuple[float, float]:
-        """Return smallest and largest radius, px, no larger than the image."""
+    def _radii(self, relief: Relief, learned: Circles | None, height: int, width: int) -> Radii:
+        """Return which radii are looked for, none larger than the image."""
         smallest, largest = self.radius_px or (8.0, 38.0)
         if largest is None:
-            by_depth = self.diameter_mm[1] / 2000 / relief.pixel if relief else 0
+            by_depth = self.diameter_mm[1] / 2000 / relief.pixel if relief.known else 0
             largest = max(_LARGE, by_depth, largest_of(learned, LIKELY))
-        if self.radius_px is None and relief is not None:
+        if self.radius_px is None and relief.known:
             # a cap is nearer than the bed, hence larger in the image
             near = relief.bed_pixel(*np.array([(0, width, 0, width), (0, 0, height, height)]))
             least, most = self.diameter_mm
             smallest = max(5.0, least / 2000 / near.max())
             largest = 1.2 * most / 2000 / near.min()
-        return smallest, min(largest, max(height, width) / 2)
+        return Radii(smallest, min(largest, max(height, width) / 2))
 
-    def _edges(
-        self, image: Singles, gradient: Gradient, region: Bytes, relief: Relief | None
-    ) -> Strips:
+    def _edges(self, image: Singles, gradient: Gradient, region: Bytes, relief: Relief) -> Strips:
         otsu = max(otsu_of(gradient.size, _TOP), _FLOOR)
         edges, pixels = edges_of(image, gradient, region, self.edge * otsu, 1.2 * otsu)
-        if relief:
+        if relief.known:
             edges = fused(edges, pixels, relief.edges(), CELL)
         return in_strips(edges, *image.shape)
 
-    def _plausible(self, shapes: Floats, middle: Floats, relief: Relief | None) -> Bools:
+    def _plausible(self, shapes: Floats, middle: Floats, relief: Relief) -> Bools:
         """Return which candidates have a possible diameter in metres, or none that is known."""
-        inside = np.ones(len(shapes), bool)
-        if relief is not None:
-            nearer = np.nan_to_num(middle) / relief.focal
-            bed = relief.bed_pixel(shapes[:, 0], shapes[:, 1])
-            diameter = 2000 * shapes[:, 2] * (bed - nearer)
-            low, high = self.diameter_mm
-            inside = ~np.isfinite(middle) | ((diameter >= low) & (diameter <= high))
-        return inside
+        if not relief.known:
+            return np.ones(len(shapes), bool)
+        nearer = np.nan_to_num(middle) / relief.focal
+        bed = relief.bed_pixel(shapes[:, 0], shapes[:, 1])
+        diameter = 2000 * shapes[:, 2] * (bed - nearer)
+        low, high = self.diameter_mm
+        return ~np.isfinite(middle) | ((diameter >= low) & (diameter <= high))
 
     def _warm_up(self) -> None:
         for native in (np.uint16, np.float32):
@@ -285,9 +274,9 @@ def equal_area_radius(shapes: Floats) -> Floats:
     return np.asarray(np.sqrt(shapes[:, 2] ** 2 + (shapes[:, 3] ** 2 + shapes[:, 4] ** 2) / 2))
 
 
-def _foreground(inside: Bytes, relief: Relief | None) -> Bytes:
+def _foreground(inside: Bytes, relief: Relief) -> Bytes:
     """Return what is inside a mask or stands on the bed, (H, W) 0 or 1."""
-    if relief is None:
+    if not relief.known:
         return inside
     standing = (relief.height > _STANDING).view(np.uint8)
     return np.asarray(inside | doubled(standing, *inside.shape), np.uint8)

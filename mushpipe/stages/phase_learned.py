@@ -11,7 +11,7 @@ from mushpipe.core.arrays import Bools, Bytes, Floats, Ints32, Singles
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.cap_clod import off_ground
 from mushpipe.stages.cap_kin import tones_of
-from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE, certain_first, iou, lens
+from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE, Radii, certain_first, iou, lens
 
 _AROUND = 4.0  # px; a circle of a network is not more exact than that
 _SAME = 0.5  # IoU from which on an outline is that of a circle
@@ -20,10 +20,10 @@ _UNEVEN = 0.12  # spread of its brightness over the mean, below which ground hol
 _OWN = 0.5  # share of a circle that none that was accepted may cover
 
 
-def within(learned: Circles, smallest: float, largest: float) -> Circles:
-    """Return the circles of a radius (px) within the range, or a tenth beyond."""
-    enough = learned.radius >= LEAST_OF_RANGE * smallest
-    return learned.take(enough & (learned.radius <= MOST_OF_RANGE * largest))
+def of_radii(learned: Circles, radii: Radii) -> Circles:
+    """Return the circles of a radius within the range, or a tenth beyond."""
+    enough = learned.radius >= LEAST_OF_RANGE * radii.smallest
+    return learned.take(enough & (learned.radius <= MOST_OF_RANGE * radii.largest))
 
 
 def largest_of(learned: Circles | None, least: float) -> float:

@@ -8,8 +8,9 @@ import numpy as np
 
 from mushpipe.core.arrays import Floats, Ints32, Singles
 from mushpipe.core.jit import borrower, jit
-from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE
+from mushpipe.stages.discs import Radii, within
 from mushpipe.stages.phase_decide import covered
+from mushpipe.stages.phase_depth import Relief
 from mushpipe.stages.phase_refit import NARROW, around, fit_outline
 from mushpipe.stages.phase_scratch import Scratch, scratch_for
 from mushpipe.stages.phase_strips import Strips
@@ -62,26 +63,23 @@ def _keep_own(
 
 
 @jit
-def polish(
-    edges: Strips, height: Singles, pixel: float, outlines: Floats, owner: Ints32,
-    smallest: float, largest: float,
-) -> None:  # fmt: skip
+def polish(edges: Strips, relief: Relief, outlines: Floats, owner: Ints32, radii: Radii) -> None:
     """Refit accepted outlines (K, 5), in their order and in place, to what is theirs alone.
 
     Edges of others do not count, nor those within or just outside a circle that was accepted
     before: where a cap dips under another one, its steepest shading is not its outline. What leaves
-    the range of radii, px, stays as it was.
+    the range of radii stays as it was.
     """
     scratch, places = scratch_for(len(edges.x)), np.empty((2, len(edges.x)), np.float32)
     shape, near = np.empty(5), np.empty_like(outlines)
     for k in range(len(outlines)):
         shape[:] = outlines[k]
         met = _met(shape, outlines[:k], near)
-        count = around(edges, height, pixel, shape, NARROW, scratch)
+        count = around(edges, relief, shape, NARROW, scratch)
         kept = _keep_own(edges, k, count, near[:met], owner, places[0], places[1], scratch)
         moved = fit_outline(edges, kept, shape, NARROW, scratch) if kept >= OWN else False
         limit = max(1.5, 0.15 * outlines[k, 2])
         away = math.hypot(shape[0] - outlines[k, 0], shape[1] - outlines[k, 1])
-        within = smallest * LEAST_OF_RANGE <= shape[2] <= largest * MOST_OF_RANGE
-        if moved and within and abs(shape[2] - outlines[k, 2]) < limit and away < limit:
+        away = max(away, abs(shape[2] - outlines[k, 2]))
+        if moved and away < limit and within(shape[2], radii):
             outlines[k] = shape

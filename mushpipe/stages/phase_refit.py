@@ -14,8 +14,9 @@ import numpy as np
 
 from mushpipe.core.arrays import Floats, Ints32, Singles
 from mushpipe.core.jit import borrower, jit
-from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE
+from mushpipe.stages.discs import Radii, within
 from mushpipe.stages.linear import solve
+from mushpipe.stages.phase_depth import Relief
 from mushpipe.stages.phase_scratch import DIRECTIONS, Scratch, scratch_for
 from mushpipe.stages.phase_steps import step_up
 from mushpipe.stages.phase_strips import TURNED, Strips, gather, outline_hits
@@ -121,42 +122,37 @@ def fit_outline(edges: Strips, count: int, shape: Floats, stage: int, scratch: S
 
 
 @borrower
-def around(
-    edges: Strips, height: Singles, pixel: float, shape: Floats, stage: int, scratch: Scratch
-) -> int:
-    """Write the rows of edge points around an outline into `scratch.rows`; return how many."""
-    reach = max(3.0, REACH[stage] * shape[2])
-    relief = height if stage == NARROW else height[:0]
-    return gather(edges, relief, step_up(shape[2] * pixel), shape, reach, scratch)
+def reach_of(radius: float, stage: int) -> float:
+    """Return how far (px) from an outline edge points are looked for."""
+    return max(3.0, REACH[stage] * radius)
 
 
 @borrower
-def fit_around(
-    edges: Strips, height: Singles, pixel: float, shape: Floats, stage: int, scratch: Scratch
-) -> bool:
+def around(edges: Strips, relief: Relief, shape: Floats, stage: int, scratch: Scratch) -> int:
+    """Write the rows of edge points around an outline into `scratch.rows`; return how many."""
+    height = relief.height if stage == NARROW else relief.height[:0]
+    step, reach = step_up(shape[2] * relief.pixel), reach_of(shape[2], stage)
+    return gather(edges, height, step, shape, reach, scratch)
+
+
+@borrower
+def fit_around(edges: Strips, relief: Relief, shape: Floats, stage: int, scratch: Scratch) -> bool:
     """Fit an outline (5,) to the edge points around it, in place; False if they do not hold it."""
-    count = around(edges, height, pixel, shape, stage, scratch)
+    count = around(edges, relief, shape, stage, scratch)
     return count >= 2 * LEAST and fit_outline(edges, count, shape, stage, scratch)
 
 
 @jit
 def refit(
-    edges: Strips,
-    height: Singles,
-    pixel: float,
-    candidates: Singles,
-    smallest: float,
-    largest: float,
+    edges: Strips, relief: Relief, candidates: Singles, radii: Radii
 ) -> tuple[Floats, Ints32, Singles]:
     """Refit candidates (N, 4) to the edges; those that nothing holds in place are dropped.
 
     Args:
         edges: Edge points.
-        height: (h, w) m at half resolution, -1 where unknown; empty without depth.
-        pixel: Size of a pixel at the bed, m.
+        relief: What stands on the bed.
         candidates: x, y, radius (px) and magnitude.
-        smallest: Radius, px.
-        largest: Radius, px.
+        radii: Of their circles.
 
     Returns:
         Outlines (M, 5), the hits of their directions (M, `DIRECTIONS`), -2 beyond the last
@@ -172,23 +168,24 @@ def refit(
     cells = np.full((2, edges.height // BUCKET + 3, edges.width // BUCKET + 3), -1, np.int32)
     for start in STARTS:
         for k in range(len(candidates)):
-            if firm[k] or (start > 1 and candidates[k, 2] > 0.95 * largest):
+            if firm[k] or (start > 1 and candidates[k, 2] > 0.95 * radii.largest):
                 continue
             shape = shapes[kept]
             shape[0], shape[1] = candidates[k, 0], candidates[k, 1]
-            shape[2] = min(largest, start * candidates[k, 2])
+            shape[2] = min(radii.largest, start * candidates[k, 2])
             shape[3] = shape[4] = 0
-            if not fit_around(edges, height, pixel, shape, WIDE, scratch):
+            if not fit_around(edges, relief, shape, WIDE, scratch):
                 continue
             if _known(shape, wide, cells[WIDE], following[WIDE]):
                 continue  # from there the narrow fit comes to what it came to before
             wide[tried] = shape
             _enter(shape, tried, cells[WIDE], following[WIDE])
             tried += 1
-            if not fit_around(edges, height, pixel, shape, NARROW, scratch):
+            if not fit_around(edges, relief, shape, NARROW, scratch):
                 continue
-            within = smallest * LEAST_OF_RANGE <= shape[2] <= largest * MOST_OF_RANGE
-            if not within or _known(shape, shapes, cells[NARROW], following[NARROW]):
+            if not within(shape[2], radii):
+                continue
+            if _known(shape, shapes, cells[NARROW], following[NARROW]):
                 continue
             n, near = directions_of(shape[2]), tolerance(shape[2])
             found, residual[kept] = outline_hits(edges, shape, near, n, hits[kept], scratch)

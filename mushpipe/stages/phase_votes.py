@@ -20,6 +20,7 @@ import numpy as np
 
 from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.jit import borrower, jit
+from mushpipe.stages.discs import Radii
 from mushpipe.stages.phase_strips import Strips
 
 CELL = 2  # px; the accumulator has half the resolution of the image
@@ -45,7 +46,7 @@ class Rings(NamedTuple):
 
 def centres(
     edges: Strips,
-    radii: tuple[float, float],
+    radii: Radii,
     shape: tuple[int, int],
     least: float,
     every: int = 1,
@@ -54,29 +55,31 @@ def centres(
 
     Args:
         edges: What votes.
-        radii: Smallest and largest, px.
+        radii: Of the circles.
         shape: Height and width of the image, px.
         least: Smallest share.
         every: Of so many edge points one votes.
     """
-    coded = coded_range(*radii)
-    cells = vote(edges, rings_between(*coded), (-(-shape[0] // CELL), -(-shape[1] // CELL)), every)
-    found = peaks(*summed(cells), least, *coded, REACH)
-    near = (found[:, 2] > radii[0] - 2 * STEP) & (found[:, 2] < radii[1] + 2 * STEP)
+    coded = coded_range(radii)
+    cells = vote(edges, rings_between(coded), (-(-shape[0] // CELL), -(-shape[1] // CELL)), every)
+    found = peaks(*summed(cells), least, coded)
+    near = (found[:, 2] > radii.smallest - 2 * STEP) & (found[:, 2] < radii.largest + 2 * STEP)
     return found if coded == radii else found[near]
 
 
-def coded_range(smallest: float, largest: float) -> tuple[float, float]:
+def coded_range(radii: Radii) -> Radii:
     """Return the radii between which the phase turns once: `WIDE` apart at least."""
+    smallest, largest = radii
     low = max(smallest - max(0.0, WIDE - (largest - smallest)) / 2, smallest / 2)
-    return low, max(largest, low + WIDE)
+    return Radii(low, max(largest, low + WIDE))
 
 
-def rings_between(smallest: float, largest: float) -> Rings:
+def rings_between(radii: Radii) -> Rings:
     """Return radii about `STEP` apart; a full circle's votes then add up to about 1."""
+    smallest, largest = radii
     count = max(3, math.ceil((largest - smallest) / STEP) + 1)
     radius = np.linspace(smallest, largest, count)
-    phase = phase_of(radius, smallest, largest)
+    phase = phase_of(radius, radii)
     # Of an outline of 2 pi r edge points, each votes once near the centre for its own radius and,
     # being spread over the 3 x 3 cells that are summed, for the neighbouring radii too.
     spacing = (largest - smallest) / (count - 1)
@@ -85,9 +88,10 @@ def rings_between(smallest: float, largest: float) -> Rings:
     return Rings(*(part.astype(np.float32) for part in parts))
 
 
-def phase_of(radius: Floats, smallest: float, largest: float) -> Floats:
+def phase_of(radius: Floats, radii: Radii) -> Floats:
     """Return the phase of each radius."""
-    share = np.log(radius / smallest) / math.log(max(largest / smallest, 1.001))
+    span = math.log(max(radii.largest / radii.smallest, 1.001))
+    share = np.log(radius / radii.smallest) / span
     return np.asarray((1 - GAP) * (2 * np.pi * share - np.pi))
 
 
@@ -135,11 +139,11 @@ def summed(cells: Singles) -> tuple[Singles, Singles]:
 
 
 @borrower
-def highest_around(size: Singles, x: int, y: int, reach: int) -> bool:
-    """Whether no value within `reach` is higher; of equal ones the first row, then column, is."""
+def highest_around(size: Singles, x: int, y: int) -> bool:
+    """Whether no value within `REACH` is higher; of equal ones the first row, then column, is."""
     value = size[y, x]
-    for v in range(max(y - reach, 0), min(y + reach + 1, size.shape[0])):
-        for u in range(max(x - reach, 0), min(x + reach + 1, size.shape[1])):
+    for v in range(max(y - REACH, 0), min(y + REACH + 1, size.shape[0])):
+        for u in range(max(x - REACH, 0), min(x + REACH + 1, size.shape[1])):
             other = size[v, u]
             if other > value or (other == value and (v < y or (v == y and u < x))):
                 return False
@@ -155,22 +159,20 @@ def _vertex(before: float, at: float, behind: float) -> float:
 
 
 @jit
-def peaks(
-    total: Singles, size: Singles, least: float, smallest: float, largest: float,
-    reach: int,
-) -> Singles:  # fmt: skip
+def peaks(total: Singles, size: Singles, least: float, radii: Radii) -> Singles:
     """Return (N, 4): x, y, radius in px and magnitude of the local maxima of at least `least`.
 
-    A maximum is the highest of the (2 reach + 1)^2 cells around it; its place is the vertex of
+    A maximum is the highest of the (2 REACH + 1)^2 cells around it; its place is the vertex of
     parabolas. The radius inverts the phase.
     """
     height, width = size.shape
     found = np.empty((height * width // 4 + 1, 4), np.float32)
     count = 0
+    smallest, largest = radii
     log_range = math.log(max(largest / smallest, 1.001))
     for y in range(1, height - 1):
         for x in range(1, width - 1):
-            if size[y, x] < least or not highest_around(size, x, y, reach):
+            if size[y, x] < least or not highest_around(size, x, y):
                 continue
             u = x + _vertex(size[y, x - 1], size[y, x], size[y, x + 1])
             v = y + _vertex(size[y - 1, x], size[y, x], size[y + 1, x])

@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 
 from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.cap_net import CapNet
+from mushpipe.stages.discs import Radii
 from mushpipe.stages.phase_blobs import LEVELS, blobs_of
-from mushpipe.stages.phase_depth import Relief
+from mushpipe.stages.phase_depth import NO_RELIEF, Relief
 from mushpipe.stages.phase_hough import PhaseHough
 from tests.stages.frames import field_data, recorded
 
@@ -18,8 +19,8 @@ EXACT = 7.5  # px of the image: nearly four of the map; heights are looked at in
 
 
 def relief(height: np.ndarray) -> Relief:
-    depth = np.full(height.shape, 0.4, np.float32)
-    return Relief(depth, height.astype(np.float32), np.array([1 / 0.4, 0, 0]), 600.0)
+    known = height.astype(np.float32)
+    return NO_RELIEF._replace(height=known, filled=known)
 
 
 def disc(x: float, y: float, r: float, height: float = 0.05) -> np.ndarray:
@@ -35,9 +36,9 @@ def disc(x: float, y: float, r: float, height: float = 0.05) -> np.ndarray:
 def test_a_thing_that_stands_alone_is_a_disc_and_at_several_levels_the_same(
     x: float, y: float, r: float, height: float
 ) -> None:
-    found = blobs_of(relief(disc(x, y, r, height)), 8, 60)
+    found = blobs_of(relief(disc(x, y, r, height)), Radii(8, 60))
     assert np.unique(np.abs(found[:, :3] - (x, y, r)).max(axis=1) <= EXACT).tolist() == [True]
-    low = blobs_of(relief(disc(x, y, r, LEVELS[0] + 0.001)), 8, 60)  # seen at one level only
+    low = blobs_of(relief(disc(x, y, r, LEVELS[0] + 0.001)), Radii(8, 60))  # seen at one level only
     assert len(found) == len(low)
 
 
@@ -51,7 +52,7 @@ def test_discs_fit_into_what_stands_and_touch_its_border(seed: int) -> None:
         (x, y), r = rng.uniform(40, (280, 200)), rng.uniform(12, 40)
         height = np.maximum(height, disc(x, y, r, rng.uniform(0.002, 0.06)))
     v, u = np.mgrid[:HEIGHT, :WIDTH]
-    for x, y, r, _ in blobs_of(relief(height), 8, 60):
+    for x, y, r, _ in blobs_of(relief(height), Radii(8, 60)):
         away = np.hypot(2 * u + 0.5 - x, 2 * v + 0.5 - y)
         to_lower = [away[height <= level].min() for level in LEVELS]
         assert np.abs(np.array(to_lower) - r).min() <= EXACT
@@ -60,7 +61,7 @@ def test_discs_fit_into_what_stands_and_touch_its_border(seed: int) -> None:
 def test_a_part_of_something_larger_is_none() -> None:
     bar = np.zeros((HEIGHT, WIDTH))
     bar[40:80, 10:150] = 0.05  # the discs along it are lower at two sides alone
-    inner = blobs_of(relief(bar), 8, 60)[:, 0]
+    inner = blobs_of(relief(bar), Radii(8, 60))[:, 0]
     assert not ((inner > 70) & (inner < 250)).any()
 
 
@@ -68,24 +69,24 @@ def test_a_low_cap_is_parted_from_the_stem_that_it_leans_on() -> None:
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     stem = np.hypot((2 * u - 140) / 85, (2 * v - 120) / 44) <= 1
     height = np.maximum(disc(100, 120, 40, 0.034), np.where(stem, 0.024, 0.0))
-    found = blobs_of(relief(height), 8, 60)
+    found = blobs_of(relief(height), Radii(8, 60))
     assert (np.abs(found[:, :3] - (100, 120, 40)).max(axis=1) <= EXACT).any()
 
 
 @pytest.mark.parametrize("level", [-1.0, 0.0, 0.003, 0.05])
 def test_what_is_all_of_one_height_or_unknown_holds_none(level: float) -> None:
-    assert blobs_of(relief(np.full((HEIGHT, WIDTH), level)), 8, 60).shape == (0, 4)
+    assert blobs_of(relief(np.full((HEIGHT, WIDTH), level)), Radii(8, 60)).shape == (0, 4)
 
 
 def test_discs_beyond_the_range_are_left_out() -> None:
     scene = relief(disc(160, 120, 40))
-    assert len(blobs_of(scene, 30, 50))
-    assert not len(blobs_of(scene, 8, 30))
-    assert not len(blobs_of(scene, 50, 80))
+    assert len(blobs_of(scene, Radii(30, 50)))
+    assert not len(blobs_of(scene, Radii(8, 30)))
+    assert not len(blobs_of(scene, Radii(50, 80)))
 
 
 def test_a_cap_at_the_border_is_a_disc_that_goes_on_beyond_it() -> None:
-    found = blobs_of(relief(disc(0, 120, 40)), 8, 60)
+    found = blobs_of(relief(disc(0, 120, 40)), Radii(8, 60))
     assert np.abs(found[:, :3] - (0, 120, 40)).max() <= EXACT
 
 

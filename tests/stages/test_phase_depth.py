@@ -1,12 +1,9 @@
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import Any
-
 import numpy as np
 import pytest
 
-from mushpipe.stages.phase_depth import halved
+from mushpipe.stages.phase_depth import NO_RELIEF, halved
 from mushpipe.stages.phase_hough import _foreground
 
 
@@ -35,7 +32,6 @@ def test_what_stands_on_the_bed_is_added_to_the_mask(shape: tuple[int, int]) -> 
     rng = np.random.default_rng(4)
     mask = (rng.random(shape) < 0.3).astype(np.uint8)
     height = rng.random(((shape[0] + 1) // 2, (shape[1] + 1) // 2)).astype(np.float32) / 100
-    relief: Any = SimpleNamespace(height=height)
-    both = _foreground(mask, relief)
+    both = _foreground(mask, NO_RELIEF._replace(height=height))
     for y, x in np.ndindex(*shape):
         assert both[y, x] == (mask[y, x] or height[y // 2, x // 2] > 0.004)

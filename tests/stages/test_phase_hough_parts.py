@@ -7,9 +7,9 @@ import pytest
 
 from mushpipe import Mask
 from mushpipe.stages.bed import far_cells, fit_plane, plane_depth
-from mushpipe.stages.discs import lens
+from mushpipe.stages.discs import Radii, lens
 from mushpipe.stages.phase_decide import decide, outline_features, overlap_features
-from mushpipe.stages.phase_depth import GRID, closed, halved, relief_of
+from mushpipe.stages.phase_depth import GRID, NO_RELIEF, closed, halved, relief_of
 from mushpipe.stages.phase_edges import edges_of, gradient_of, otsu_of
 from mushpipe.stages.phase_features import (
     DEPTH_FEATURES,
@@ -28,7 +28,6 @@ from mushpipe.stages.verifier_net import Models
 from tests.stages.scenes import discs, frame_of, sphere_depth
 
 ALL = np.ones((120, 160), np.uint8)
-NO_HEIGHT = np.zeros((0, 0), np.float32)
 
 
 def gray_of(image: np.ndarray) -> np.ndarray:
@@ -44,7 +43,7 @@ def static_row(
     image: np.ndarray,
     shape: tuple[float, float, float],
     mask: np.ndarray | None = None,
-    height: np.ndarray = NO_HEIGHT,
+    height: np.ndarray = NO_RELIEF.height,
 ) -> tuple[dict[str, float], np.ndarray]:
     gray = gray_of(image)
     hits = np.full((1, DIRECTIONS), -2, np.int32)
@@ -52,9 +51,8 @@ def static_row(
     covered = ALL if mask is None else mask.astype(np.uint8)
     outline = np.array([[*shape, 0.0, 0.0]])
     residual = np.array([0.5], np.float32)
-    table, _ = static_features(
-        gray, gradient_of(gray), covered, height, 0.002, outline, hits, residual
-    )
+    relief = NO_RELIEF._replace(height=height, pixel=0.002)
+    table, _ = static_features(gray, gradient_of(gray), covered, relief, outline, hits, residual)
     return dict(zip(NAMES, table[0], strict=True)), hits[0]
 
 
@@ -90,7 +88,7 @@ def test_otsu_of_two_levels_lies_between_them() -> None:
 
 
 def test_phases_of_the_smallest_and_largest_radius_leave_a_gap() -> None:
-    low, high = phase_of(np.array([8.0, 38.0]), 8, 38)
+    low, high = phase_of(np.array([8.0, 38.0]), Radii(8, 38))
     assert high - low == pytest.approx(2 * np.pi * (1 - GAP))
     assert low == pytest.approx(-high)
 
@@ -101,8 +99,9 @@ def test_the_peak_of_a_full_circle_is_about_one_and_its_phase_the_radius(
     radius: float, every: int
 ) -> None:
     found = edges(discs([(80, 60, radius)], 0.8, 0.1))
-    total, size = summed(vote(found, rings_between(8, 38), (60, 80), every))
-    best = max(peaks(total, size, 0.2, 8, 38, 3).tolist(), key=lambda peak: peak[3])
+    radii = Radii(8.0, 38.0)
+    total, size = summed(vote(found, rings_between(radii), (60, 80), every))
+    best = max(peaks(total, size, 0.2, radii).tolist(), key=lambda peak: peak[3])
     assert best[:3] == pytest.approx([80, 60, radius], abs=1.2)
     assert 0.6 < best[3] < 1.4
 
@@ -224,7 +223,6 @@ def test_heights_of_a_ball_over_the_bed() -> None:
     image = np.full((120, 160), 0.5)
     frame = frame_of(image, sphere_depth((0.0, 0.0, 0.4), 0.04, 0.42))
     relief = relief_of(frame)
-    assert relief is not None
     assert relief.height.max() == pytest.approx(0.06, abs=0.003)
     assert np.median(relief.height) == pytest.approx(0, abs=0.002)
 

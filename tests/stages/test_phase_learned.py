@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 from mushpipe import Circles, Mask, UsageError
+from mushpipe.stages.discs import Radii
 from mushpipe.stages.phase_hough import PhaseHough
 from mushpipe.stages.phase_learned import (
     add_discs,
     agreement,
     candidates_of,
+    of_radii,
     with_bare,
-    within,
     without_clods,
 )
 from tests.stages.caps import cap, draw, frame_from
@@ -33,7 +34,8 @@ def test_agreement_is_score_times_shared_area() -> None:
 
 def test_candidates_are_the_circles_of_the_range_and_a_tenth_beyond() -> None:
     rows = [(50.0, 40.0, radius, 0.5) for radius in (7.1, 7.3, 20.0, 49.0, 50.0)]
-    assert candidates_of(within(circles(*rows), 8, 45)) == pytest.approx(np.array(rows[1:4]))
+    found = candidates_of(of_radii(circles(*rows), Radii(8, 45)))
+    assert found == pytest.approx(np.array(rows[1:4]))
 
 
 def test_beside_a_network_less_of_an_outline_makes_no_candidate_unless_it_is_asked_for() -> None:
