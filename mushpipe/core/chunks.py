@@ -1,4 +1,4 @@
-"""What an MCAP file's summary says; chunks side by side in time, as where each holds one topic."""
+"""Chunks of an MCAP file that lie side by side in time, as where each holds one topic."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from mcap.data_stream import ReadDataStream
-from mcap.records import Chunk, ChunkIndex, McapRecord, Message, MessageIndex, Statistics
-from mcap.summary import Summary
+from mcap.records import Chunk, ChunkIndex, McapRecord, Message, MessageIndex
 
 _HEAD = 9  # bytes of a record's opcode and length
 Unpack = Callable[[Chunk], Iterable[McapRecord]]
@@ -73,15 +72,3 @@ def by_log_time(
                     yield record
         while waiting:
             yield heapq.heappop(waiting)[-1]
-
-
-def require_complete(summary: Summary, statistics: Statistics) -> None:
-    """Raise ValueError where a summary leaves out what it may: then the file has to be read."""
-    stated = {
-        "counts": bool(statistics.channel_message_counts) or not statistics.message_count,
-        "schemas": all(c.schema_id in (0, *summary.schemas) for c in summary.channels.values()),
-        "metadata": statistics.metadata_count == len(summary.metadata_indexes),
-        "attachments": statistics.attachment_count == len(summary.attachment_indexes),
-    }
-    if missing := [name for name, whole in stated.items() if not whole]:
-        raise ValueError(f"the summary lacks {', '.join(missing)}")

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import struct
-import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import NamedTuple
 
 from mcap.exceptions import InvalidMagic, McapError
 from mcap.reader import SeekingReader
@@ -28,8 +26,9 @@ from mcap.records import Message as McapMessage
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 from zstandard import ZstdError
 
-from mushpipe.core.chunks import by_log_time, require_complete, side_by_side
+from mushpipe.core.chunks import by_log_time, side_by_side
 from mushpipe.core.errors import InputError, UsageError
+from mushpipe.core.summary import is_intact, require_complete
 from mushpipe.core.truth import TABLE
 
 # What mcap's reader raises on bytes that are not what they claim to be.
@@ -37,12 +36,9 @@ GARBAGE = (
     *(McapError, ValueError, struct.error, ZstdError, RuntimeError, MemoryError, TypeError),
     *(OverflowError, LookupError, OSError),
 )
-# opcode, length, start of the summary, start of its offsets, CRC of all from that start to here
-_FOOTER = struct.Struct("<BQQQI")
 MANIFEST = "mushpipe.manifest"
 SUMMARY = "mushpipe.summary"
 GRAPH = "mushpipe.graph"
-
 
 ZSTD = b"\x28\xb5\x2f\xfd"  # what Zstandard's frames begin with
 CONVERT = "'rosbags-convert --src {} --dst NEW_FOLDER --dst-storage mcap'"
@@ -238,20 +234,11 @@ class RecordingReader:
                 self._index = self._index_by_scan()
         return self._index
 
-    def _check_summary(self, file: BinaryIO) -> None:
-        """Raise ValueError where there is no summary, or its CRC does not match."""
-        end = file.seek(-_FOOTER.size - 8, os.SEEK_END)
-        start, _, crc = _FOOTER.unpack(file.read(_FOOTER.size))[2:]
-        if not 0 < start <= end:
-            raise ValueError("no summary")
-        file.seek(start)
-        if crc and zlib.crc32(file.read(end + _FOOTER.size - 4 - start)) != crc:
-            self._note("its index is corrupt")
-            raise ValueError("corrupt summary")
-
     def _index_from_summary(self) -> Index:
         with self.path.open("rb") as file:
-            self._check_summary(file)
+            if not is_intact(file):
+                self._note("its index is corrupt")
+                raise ValueError("corrupt summary")
             file.seek(0)
             reader = SeekingReader(file, record_size_limit=self.path.stat().st_size)
             summary = reader.get_summary()

@@ -1,0 +1,40 @@
+"""Whether the summary of an MCAP file can be believed: else the whole file has to be read."""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from typing import BinaryIO
+
+from mcap.records import Statistics
+from mcap.summary import Summary
+
+# opcode, length, start of the summary, start of its offsets, CRC of all from that start to here
+_FOOTER = struct.Struct("<BQQQI")
+
+
+def is_intact(file: BinaryIO) -> bool:
+    """Return whether a file's summary has the CRC that is stated, if one is.
+
+    Raises:
+        ValueError: There is no summary.
+    """
+    end = file.seek(-_FOOTER.size - 8, os.SEEK_END)
+    start, _, crc = _FOOTER.unpack(file.read(_FOOTER.size))[2:]
+    if not 0 < start <= end:
+        raise ValueError("no summary")
+    file.seek(start)
+    return not crc or zlib.crc32(file.read(end + _FOOTER.size - 4 - start)) == crc
+
+
+def require_complete(summary: Summary, statistics: Statistics) -> None:
+    """Raise ValueError where a summary leaves out what it may."""
+    stated = {
+        "counts": bool(statistics.channel_message_counts) or not statistics.message_count,
+        "schemas": all(c.schema_id in (0, *summary.schemas) for c in summary.channels.values()),
+        "metadata": statistics.metadata_count == len(summary.metadata_indexes),
+        "attachments": statistics.attachment_count == len(summary.attachment_indexes),
+    }
+    if missing := [name for name, whole in stated.items() if not whole]:
+        raise ValueError(f"the summary lacks {', '.join(missing)}")
