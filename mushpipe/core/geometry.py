@@ -148,6 +148,11 @@ class Camera:
             )
 
     @property
+    def focal(self) -> float:
+        """The mean focal length."""
+        return (self.fx + self.fy) / 2
+
+    @property
     def centred(self) -> bool:
         """Whether the principal point lies within the image."""
         return 0 <= self.cx < self.width and 0 <= self.cy < self.height

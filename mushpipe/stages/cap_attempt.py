@@ -6,15 +6,15 @@ it may have started in a wrong circle. Both show in its misfit, and in what surr
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from mushpipe.core.arrays import Floats, Ints32, Singles
+from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.cap_blocks import Cut, Image, Sensor, own_depth, room_to_cut
-from mushpipe.stages.cap_model import HEIGHT, ROOM, SIZE, Vector
-from mushpipe.stages.cap_outline import LANES_ROOM, expected_reach, sample_outline
+from mushpipe.stages.cap_model import HEIGHT, ROOM, SIZE
+from mushpipe.stages.cap_outline import LANES_ROOM, Lanes, expected_reach, sample_outline
 from mushpipe.stages.cap_regrow import denials, regrow
 from mushpipe.stages.cap_samples import (
     ASTRAY,
@@ -28,7 +28,16 @@ from mushpipe.stages.cap_samples import (
     sample_edges,
     touch,
 )
-from mushpipe.stages.cap_solve import ROUND, STAGES, Noise, refine, variance_of_tilt, workspace
+from mushpipe.stages.cap_solve import (
+    ROUND,
+    STAGES,
+    Noise,
+    Upright,
+    Work,
+    refine,
+    variance_of_tilt,
+    workspace,
+)
 from mushpipe.stages.cap_start import CONICAL, USUAL, axis_of, start
 
 POOR = 0.9  # misfit (a usual cap has 0.25) at which a fit starts again; it widens the sigmas, too
@@ -45,11 +54,10 @@ POINTS, EDGES, LINES, OTHERS, WEIGHT, EXTENT, MISFIT, TILT = range(COUNTS)
 
 
 class Frame(NamedTuple):
-    """What caps are fitted to: luma (H, W) 0..1, depth, and the focal length, px."""
+    """What caps are fitted to: luma (H, W) 0..1, and depth."""
 
     gray: Singles
     image: Image
-    focal: float
 
 
 class Settings(NamedTuple):
@@ -88,23 +96,23 @@ class Room(NamedTuple):
         grown: (3,) that circle: x, y, radius, px.
     """
 
-    work: Any
+    work: Work
     cut: Cut
-    lanes: tuple[Singles, Ints32]
+    lanes: Lanes
     rival: Fit
     other: Fit
     grown: Floats
 
 
 @jit
-def blank() -> Any:
+def blank() -> Fit:
     """Return room for a fit."""
     return Fit(np.empty((6, ROOM), np.float32), np.empty(SIZE), np.zeros(COUNTS))
 
 
 @jit
-def scratch(height: int, width: int) -> Any:
-    """Return a `Room` for images (H, W)."""
+def scratch(height: int, width: int) -> Room:
+    """Return room for images (H, W)."""
     lanes = (np.empty(LANES_ROOM, np.float32), np.empty(2 * DIRECTIONS, np.int32))
     return Room(workspace(), room_to_cut(height, width), lanes, blank(), blank(), np.empty(3))
 
@@ -114,9 +122,8 @@ def gather(
     image: Image,
     circle: Floats,
     rank: int,
-    focal: float,
     sensor: Sensor,
-    room: Any,
+    room: Room,
     rays: Singles,
 ) -> tuple[int, int, int, float]:
     """Take the rays of a cap; return what there is of it.
@@ -125,16 +132,16 @@ def gather(
         Numbers of its points, of points of other depth and of edge rays; its middle depth, m.
     """
     cut, lanes = room.cut, room.lanes
-    window = own_depth(image.depth, image.ranks, rank, circle, OUTER, cut.own)
-    n, other, middle = sample_depth(window, cut, image.rays, circle, focal, sensor, rays[:, ROUND:])
+    window = own_depth(image, rank, circle, OUTER, cut.own)
+    n, other, middle = sample_depth(window, cut, image, circle, sensor, rays[:, ROUND:])
     if n == 0:
         return 0, other, 0, 0.0
     edges = rays[:, ROUND + n :]
-    m = sample_edges(window, cut.own, image.rays, circle, focal, middle, sensor.edge, lanes, edges)
+    m = sample_edges(window, cut.own, image, circle, middle, sensor.edge, lanes, edges)
     for j in range(ROUND):
         turn = COMPASS[j * (DIRECTIONS // ROUND)]
         x, y = circle[0] + circle[2] * turn[0], circle[1] + circle[2] * turn[1]
-        touch(rays, j, place(image.rays, focal, x, y), 0.0, 0.0)
+        touch(rays, j, place(image, x, y), 0.0, 0.0)
     normalise(rays, ROUND + n + m)
     return n, other, m, middle - sensor.bias
 
@@ -142,7 +149,7 @@ def gather(
 @borrower
 def attempt(
     frame: Frame, circle: Floats, rank: int, size: float, seen: tuple[Singles, int],
-    upright: tuple[Vector, float], settings: Settings, cap: Floats, room: Any,
+    upright: Upright, settings: Settings, cap: Floats, room: Room,
 ) -> tuple[int, float]:  # fmt: skip
     """Fit a cap from where it starts: to its depth, then to its outline in colour as well.
 
@@ -152,7 +159,7 @@ def attempt(
         rank: Of the circle.
         size: Its radius at the cap, m.
         seen: The cap's rays (6, ROOM), with room for those of the outline, and how many there are.
-        upright: Unit vector and spread of tilts, rad.
+        upright: How caps stand.
         settings: How.
         cap: (15,) parameters, in and out.
         room: From `scratch`; the last step's normal matrix, factored, stays in its workspace.
@@ -160,14 +167,13 @@ def attempt(
     Returns:
         Number of rays along the outline in colour, and the misfit, infinite without a solution.
     """
-    gray, image, focal = frame
-    (rays, count), setting, work = seen, (settings.noise, 1.0 / focal, size), room.work
+    gray, image = frame
+    (rays, count), setting, work = seen, (settings.noise, 1.0 / image.focal, size), room.work
     if refine(cap, rays, count, upright, setting, STAGES[0], STAGES[1], work)[0] < 0.0:
         return 0, np.inf
     lines = sample_outline(
-        gray, image.rays, image.ranks, rank, cap, circle, focal, settings.outline_px, room.lanes,
-        rays[:, count:],
-    )  # fmt: skip
+        gray, image, rank, cap, circle, settings.outline_px, room.lanes, rays[:, count:]
+    )
     total, misfit = refine(cap, rays, count + lines, upright, setting, STAGES[1], STAGES[2], work)
     return (lines, misfit) if total >= 0.0 else (0, np.inf)
 
@@ -182,8 +188,8 @@ def take(rays: Singles, other: Singles, first: int, last: int) -> None:
 
 @borrower
 def fit_circle(
-    frame: Frame, circle: Floats, rank: int, upright: tuple[Vector, float], settings: Settings,
-    fit: Any, room: Any,
+    frame: Frame, circle: Floats, rank: int, upright: Upright, settings: Settings,
+    fit: Fit, room: Room,
 ) -> float:  # fmt: skip
     """Fit the cap in a circle, from several starts if the first fit is poor; return the misfit.
 
@@ -191,26 +197,26 @@ def fit_circle(
         frame: What it is fitted to.
         circle: (3,) x, y, radius, px.
         rank: Of the circle.
-        upright: Unit vector and spread of tilts, rad.
+        upright: How caps stand.
         settings: How.
         fit: Out, but for weight and misfit, which `second_fit` adds. Without a fit the counts stay
             as they are and the misfit is infinite.
         room: From `scratch`.
     """
-    _, image, focal = frame
-    (rays, cap, counts), rival, normal = fit, room.rival, room.work[0][0]
-    n, other, m, middle = gather(image, circle, rank, focal, settings.sensor, room, rays)
+    image, (rays, cap, counts) = frame.image, fit
+    rival, normal = room.rival, room.work[0][0]
+    n, other, m, middle = gather(image, circle, rank, settings.sensor, room, rays)
     if n < settings.least or middle <= 0.0:
         return np.inf
-    size, count, points = circle[2] * middle / focal, ROUND + n + m, rays[:, ROUND:]
-    ray = ray_at(image.rays, focal, circle[0], circle[1])
-    start(cap, axis_of(points, n, upright[0], ray, USUAL[0]), USUAL, ray, middle, size)
+    size, count, points = circle[2] * middle / image.focal, ROUND + n + m, rays[:, ROUND:]
+    ray = ray_at(image, circle[0], circle[1])
+    start(cap, axis_of(points, n, upright.up, ray, USUAL[0]), USUAL, ray, middle, size)
     lines, misfit = attempt(frame, circle, rank, size, (rays, count), upright, settings, cap, room)
     variance = variance_of_tilt(normal)
     if misfit > POOR:
         take(rival.rays, rays, 0, count)
-        leaning = axis_of(points, n, upright[0], ray, CONICAL[0])
-        for axis in (upright[0], (-ray[0], -ray[1], -ray[2]), leaning):
+        leaning = axis_of(points, n, upright.up, ray, CONICAL[0])
+        for axis in (upright.up, (-ray[0], -ray[1], -ray[2]), leaning):
             start(rival.cap, axis, CONICAL, ray, middle, size)
             found, rest = attempt(
                 frame, circle, rank, size, (rival.rays, count), upright, settings, rival.cap, room
@@ -227,17 +233,17 @@ def fit_circle(
 
 @borrower
 def denied_by(
-    frame: Frame, circle: Floats, ranks: tuple[int, int], cap: Floats, bias: float, room: Any
+    frame: Frame, circle: Floats, ranks: tuple[int, int], cap: Floats, bias: float, room: Room
 ) -> int:
     """Return in how many directions depth denies the outline of a cap (15,) fitted in a circle."""
-    expected_reach(cap, frame.image.rays, frame.focal, circle, *room.lanes)
+    expected_reach(cap, frame.image, circle, *room.lanes)
     return denials(frame.image, ranks, cap, bias, circle, room.lanes[0])
 
 
 @borrower
 def fit_cap(
-    frame: Frame, circle: Floats, ranks: tuple[int, int], upright: tuple[Vector, float],
-    settings: Settings, fit: Fit, room: Any,
+    frame: Frame, circle: Floats, ranks: tuple[int, int], upright: Upright,
+    settings: Settings, fit: Fit, room: Room,
 ) -> None:  # fmt: skip
     """Fit the cap in a circle; where depth denies it, in the circle that depth suggests, too.
 
@@ -248,7 +254,7 @@ def fit_cap(
         frame: What it is fitted to.
         circle: (3,) x, y, radius, px, as detected.
         ranks: Of the circle, and of no circle.
-        upright: Unit vector and spread of tilts, rad.
+        upright: How caps stand.
         settings: How.
         fit: Out, as by `fit_circle`; without a fit it keeps its count of 0.
         room: From `scratch`.
@@ -263,7 +269,7 @@ def fit_cap(
     if misfit < POOR and denied < DENIED:
         return
     middle = fit.cap[2] - 0.5 * fit.cap[HEIGHT] + bias
-    if not regrow(frame.image, ranks, circle, frame.focal, middle, grown):
+    if not regrow(frame.image, ranks, circle, middle, grown):
         return
     rest = fit_circle(frame, grown, ranks[0], upright, settings, other, room)
     if not rest < 2.0 * POOR:

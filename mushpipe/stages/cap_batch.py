@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from mushpipe.stages.cap_attempt import (
     WEIGHT,
     Fit,
     Frame,
+    Room,
     Settings,
     fit_cap,
     scratch,
@@ -43,7 +43,7 @@ from mushpipe.stages.cap_model import (
     slope,
 )
 from mushpipe.stages.cap_samples import ASTRAY, DIRECTIONS, ray_at
-from mushpipe.stages.cap_solve import ROUND, STAGES, invert, refine, tilt
+from mushpipe.stages.cap_solve import ROUND, STAGES, Upright, invert, refine, tilt
 from mushpipe.stages.cap_start import spread_of
 
 ROUNDNESS = 0.01  # in rim radii: how far the rim of a cap is from the circle of its area
@@ -100,26 +100,25 @@ class Fits:
 
 @borrower
 def second_fit(
-    frame: Frame, circle: Floats, upright: tuple[Vector, float], settings: Settings, fit: Fit,
-    covariance: Floats, told: Floats, room: Any,
+    frame: Frame, circle: Floats, upright: Upright, settings: Settings, fit: Fit,
+    covariance: Floats, told: Floats, room: Room,
 ) -> None:  # fmt: skip
     """Refine a fit with what the scene says of its cap's tilt, and then its circle, in place.
 
     Arguments as `fit_cap`, and out: covariance (8, 8), and what follows from the fit, (TOLD,), as
     `locate` and `describe` fill it. If any of it is not finite, the count of points becomes 0.
     """
-    _, image, focal = frame
-    (rays, cap, counts), noise = fit, settings.noise
+    image, (rays, cap, counts), noise = frame.image, fit, settings.noise
     count = ROUND + int(counts[POINTS] + counts[EDGES] + counts[LINES])
-    setting = (noise, 1.0 / focal, counts[EXTENT])
+    setting = (noise, 1.0 / image.focal, counts[EXTENT])
     counts[WEIGHT], counts[MISFIT] = refine(
         cap, rays, count, upright, setting, STAGES[2], STAGES[3], room.work
     )
     invert(room.work[0][0], covariance)
     held, doubt = (counts[EDGES], counts[LINES]), max(1.0, counts[MISFIT] / POOR)
-    improve(circle, cap, held, doubt, image.rays, focal, room.lanes)
-    ray = ray_at(image.rays, focal, circle[0], circle[1])
-    locate(cap, ray, covariance, noise.circle_px / focal, told)
+    improve(circle, cap, held, doubt, image, room.lanes)
+    ray = ray_at(image, circle[0], circle[1])
+    locate(cap, ray, covariance, noise.circle_px / image.focal, told)
     describe(fit, covariance, told)
     total = counts[WEIGHT] + counts[MISFIT]
     for value in cap:
@@ -132,8 +131,8 @@ def second_fit(
 
 @jit
 def fit_all(
-    frame: Frame, circles: Floats, rank: Ints, upright: tuple[Vector, float],
-    settings: Settings, out: Any,
+    frame: Frame, circles: Floats, rank: Ints, upright: Upright,
+    settings: Settings, out: tuple[Floats, ...],
 ) -> None:  # fmt: skip
     """Fit every cap, first with the same prior for all, then with what they say of the scene.
 
@@ -141,7 +140,7 @@ def fit_all(
         frame: What they are fitted to.
         circles: (N, 3) x, y, radius, px.
         rank: (N,) of them, as `ranks` from `by_depth`.
-        upright: Unit vector and spread of tilts, rad.
+        upright: How caps stand.
         settings: How.
         out: Per cap its circle, improved; parameters, covariance, what follows, and counts, as by
             `second_fit`. A cap without a fit keeps its circle and has a count of 0, the rest NaN.
@@ -154,14 +153,14 @@ def fit_all(
         fit = Fit(rays[i], caps[i], counts[i])
         fit_cap(frame, circles[i], (rank[i], n), upright, settings, fit, room)
         if counts[i, POINTS] > 0:
-            first, second = tilt(caps[i], upright[0])
+            first, second = tilt(caps[i], upright.up)
             squares[i] = first * first + second * second
             variances[i] = counts[i, TILT]
-    spread_of(squares, variances, upright[1], spreads)
+    spread_of(squares, variances, upright.spread, spreads)
     for i in range(n):
         if counts[i, POINTS] > 0:
             improved[i] = circles[i]
-            fit, own = Fit(rays[i], caps[i], counts[i]), (upright[0], spreads[i])
+            fit, own = Fit(rays[i], caps[i], counts[i]), Upright(upright.up, spreads[i])
             second_fit(frame, improved[i], own, settings, fit, covariances[i], told[i], room)
         if not counts[i, POINTS] > 0:
             improved[i] = circles[i]
@@ -228,7 +227,7 @@ def fit_caps(
     frame: Frame,
     circles: Floats,
     rank: Ints,
-    upright: tuple[Floats, float],
+    upright: Upright,
     settings: Settings,
 ) -> Fits:
     """Fit a cap to the depth in each circle.
@@ -237,7 +236,7 @@ def fit_caps(
         frame: What they are fitted to.
         circles: (N, 3) x, y, radius, px.
         rank: (N,) of them, as `ranks` from `by_depth`.
-        upright: Unit vector (3,) and the spread of tilts off it per direction, rad.
+        upright: How caps stand.
         settings: How.
     """
     n = len(circles)
@@ -248,9 +247,8 @@ def fit_caps(
         np.empty((n, TOLD)),
         np.zeros((n, COUNTS)),
     )
-    up = (float(upright[0][0]), float(upright[0][1]), float(upright[0][2]))
-    fit_all(frame, circles, rank, (up, upright[1]), settings, out)
-    return _fits(*out, upright[0])
+    fit_all(frame, circles, rank, upright, settings, out)
+    return _fits(*out, np.array(upright.up))
 
 
 def _fits(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,11 +33,13 @@ class Image(NamedTuple):
         depth: (H, W) m, missing where not above 0.
         rays: (H, W, 2) rays of the pixels at z = 1, beyond 1e3 where a pixel has none.
         ranks: (H, W) rank of the nearest circle that covers the pixel, from `by_depth`.
+        focal: Focal length, px.
     """
 
     depth: Singles
     rays: Singles
     ranks: NDArray[np.int16]
+    focal: float
 
 
 class Sensor(NamedTuple):
@@ -82,8 +84,8 @@ class Cut(NamedTuple):
 
 
 @jit
-def room_to_cut(height: int, width: int) -> Any:
-    """Return a `Cut` for images (H, W)."""
+def room_to_cut(height: int, width: int) -> Cut:
+    """Return room for images (H, W)."""
     return Cut(
         np.empty(height * width, np.float32),
         np.empty(3 * K, np.int32),
@@ -99,19 +101,11 @@ def half_width(radius: float) -> int:
 
 
 @borrower
-def own_depth(
-    depth: Singles,
-    ranks: NDArray[np.int16],
-    rank: int,
-    circle: Floats,
-    reach: float,
-    own: Singles,
-) -> Window:
+def own_depth(image: Image, rank: int, circle: Floats, reach: float, own: Singles) -> Window:
     """Cut the depth around a circle out of an image.
 
     Args:
-        depth: (H, W) m, missing where not above 0.
-        ranks: (H, W) rank of the nearest circle that covers the pixel.
+        image: What it is cut out of.
         rank: This circle's; pixels of a lower one are hidden.
         circle: (3,) x, y, radius, px.
         reach: How far around the centre, in radii.
@@ -121,7 +115,7 @@ def own_depth(
     Returns:
         What of the image that is.
     """
-    far = reach * circle[2] + 2.0
+    depth, ranks, far = image.depth, image.ranks, reach * circle[2] + 2.0
     left = min(max(int(circle[0] - far), 0), depth.shape[1])
     right = min(max(int(circle[0] + far) + 2, left), depth.shape[1])
     top = min(max(int(circle[1] - far), 0), depth.shape[0])

@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from mushpipe.core.arrays import Floats, Ints32, Singles
+from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.jit import borrower
+from mushpipe.stages.cap_blocks import Image
 from mushpipe.stages.cap_model import Vector
-from mushpipe.stages.cap_outline import expected_reach
+from mushpipe.stages.cap_outline import Lanes, expected_reach
 from mushpipe.stages.cap_samples import COMPASS, DIRECTIONS
 
 CLEAR = 0.8  # weight of a detected circle whose outline the image shows all around
@@ -47,9 +48,8 @@ def improve(
     cap: Floats,
     held: tuple[float, float],
     doubt: float,
-    rays: Singles,
-    focal: float,
-    room: tuple[Singles, Ints32],
+    image: Image,
+    room: Lanes,
 ) -> None:
     """Move a circle (3,) x, y, radius, px, towards the outline of its cap, in place.
 
@@ -59,11 +59,10 @@ def improve(
         held: Numbers of rays along the depth edge and along the outline in the image, of
             `DIRECTIONS` each.
         doubt: 1 where the cap fits, larger where it fits badly.
-        rays: (H, W, 2) rays at z = 1.
-        focal: Focal length, px.
+        image: Whose rays are taken.
         room: As in `sample_outline`.
     """
-    expected_reach(cap, rays, focal, circle, *room)
+    expected_reach(cap, image, circle, *room)
     outline = circle_around(circle, room[0])
     apart = np.hypot(outline[0] - circle[0], outline[1] - circle[1]) / (APART * outline[2])
     step = 1.0 - CLEAR * held[1] / DIRECTIONS / (1.0 + apart * apart)

@@ -25,7 +25,7 @@ from mushpipe.stages.cap_clod import CLOD_CHANCE, clods
 from mushpipe.stages.cap_gap import EdgeWatch
 from mushpipe.stages.cap_kin import FEWEST, kin_of, unlike
 from mushpipe.stages.cap_order import Order, by_depth
-from mushpipe.stages.cap_solve import Noise
+from mushpipe.stages.cap_solve import Noise, Upright
 from mushpipe.stages.cap_verify import chances
 from mushpipe.stages.discs import discs_of
 from mushpipe.stages.surface_fit import fit_tops, sources, variance_along, without_tip
@@ -164,11 +164,12 @@ class CapFit(Stage):
             edge=self.edge_offset_px,
         )
         rank, ranks = order or by_depth(depth, discs)
+        x, y, z = upright(self.up, depth, rays).tolist()
         return fit_caps(
-            Frame(gray, Image(depth, rays, ranks), (camera.fx + camera.fy) / 2),
+            Frame(gray, Image(depth, rays, ranks, camera.focal)),
             discs,
             rank,
-            (upright(self.up, depth, rays), float(np.radians(self.tilt_deg))),
+            Upright((x, y, z), float(np.radians(self.tilt_deg))),
             Settings(noise, sensor, self.outline_sigma_px, self.min_points),
         )
 
@@ -188,9 +189,8 @@ class CapFit(Stage):
         fitted = np.isfinite(surface[:, 0])
         tops, rows = (surface[fitted], covariance[fitted]), holes[fitted]
         discs = discs[rows]
-        focal = (camera.fx + camera.fy) / 2
         z = tops[0][:, 0] - self.depth_bias_mm / 1000
-        size, pixel = discs[:, 2] * z / focal, self.circle_sigma_px * z / focal
+        size, pixel = discs[:, 2] * z / camera.focal, self.circle_sigma_px * z / camera.focal
         along = variance_along(without_tip(*tops)[0], tops[1], size, pixel)
         fits.surface[rows] = camera.deproject(discs[:, :2], z)
         fits.sigma_surface[rows, 2] = np.maximum(fits.sigma_surface[rows, 2], np.sqrt(along))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from mushpipe.core.arrays import Floats, Singles
@@ -14,7 +12,7 @@ Six = tuple[float, float, float, float, float, float]
 
 
 @borrower
-def multiply(flat: Singles, weights: Singles, count: int, system: Any) -> None:
+def multiply(flat: Singles, weights: Singles, count: int, system: tuple[Floats, Floats]) -> None:
     """Fill the lower triangle of a normal matrix, and the gradient, from rows and their weights.
 
     Args:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mushpipe.core.arrays import Floats, Ints32, Singles
 from mushpipe.core.jit import borrower
+from mushpipe.stages.cap_blocks import Image
 from mushpipe.stages.cap_model import RADIUS, Single, beside, frozen, meet, slope
 from mushpipe.stages.cap_samples import (
     COMPASS,
@@ -40,8 +41,7 @@ Lanes = tuple[Singles, Ints32]  # (LANES_ROOM,) and (2 DIRECTIONS,)
 @borrower
 def expected_reach(
     cap: Floats,
-    rays: Singles,
-    focal: float,
+    image: Image,
     circle: Floats,
     row: Singles,
     pixels: Ints32,
@@ -52,13 +52,12 @@ def expected_reach(
 
     Args:
         cap: (15,) the cap.
-        rays: (H, W, 2) rays at z = 1; outside of the image as without distortion.
-        focal: Focal length, px.
+        image: Whose rays are taken; outside of it as without distortion.
         circle: (3,) x, y, radius, px, near the outline.
         row: (5 DIRECTIONS or more,) room; out, in front, per direction of `COMPASS`.
         pixels: (2 DIRECTIONS or more,) room.
     """
-    c, half = frozen(cap), Single(0.5)
+    c, half, rays, focal = frozen(cap), Single(0.5), image.rays, image.focal
     x, y, z, per_radius = Single(cap[0]), Single(cap[1]), Single(cap[2]), Single(1 / cap[RADIUS])
     middle, per_focal = np.sqrt(x * x + y * y + z * z), Single(1 / focal)
     right, bottom = np.int32(rays.shape[1] - 1), np.int32(rays.shape[0] - 1)
@@ -212,19 +211,17 @@ def vertex(row: Singles, j: int, count: int, sign: float) -> tuple[float, float]
 
 @borrower
 def sample_outline(
-    gray: Singles, rays: Singles, ranks: NDArray[np.int16], rank: int, cap: Floats, circle: Floats,
-    focal: float, sigma: float, room: Lanes, out: Singles,
+    gray: Singles, image: Image, rank: int, cap: Floats, circle: Floats, sigma: float, room: Lanes,
+    out: Singles,
 ) -> int:  # fmt: skip
     """Find the outline of a cap in the colour image, in 32 directions.
 
     Args:
         gray: (H, W) luma, 0..1.
-        rays: (H, W, 2) rays at z = 1.
-        ranks: (H, W) rank of the nearest circle per pixel.
+        image: Rays and ranks of its pixels.
         rank: This circle's; a place that a nearer one covers is left out.
         cap: (15,) the estimate.
         circle: (3,) x, y, radius, px.
-        focal: Focal length, px.
         sigma: Of a place on the outline, px.
         room: To work in.
         out: (6, DIRECTIONS) out: rays that touch the cap, as in `touch`.
@@ -235,10 +232,10 @@ def sample_outline(
     (row, pixels), n = room, 0
     if min(gray.shape) < 2:
         return 0
-    expected_reach(cap, rays, focal, circle, row, pixels)
+    expected_reach(cap, image, circle, row, pixels)
     half = min(REACH, max(5, int(0.2 * circle[2] / STEP)))
     count = 2 * half + 1
-    place_lines(ranks, rank, circle, half, row, pixels)
+    place_lines(image.ranks, rank, circle, half, row, pixels)
     sign = 1.0 if look_along(gray, count, row, pixels) > 0 else -1.0
     find_steepest(row, count, sign)
     for j in range(DIRECTIONS):
@@ -249,7 +246,7 @@ def sample_outline(
             continue
         reach = row[j] + (step - half) * STEP
         x, y = circle[0] + reach * COMPASS[j, 0], circle[1] + reach * COMPASS[j, 1]
-        touch(out, n, place(rays, focal, x, y), sigma * cap[2] / focal, EDGE_SHARE)
+        touch(out, n, place(image, x, y), sigma * cap[2] / image.focal, EDGE_SHARE)
         n += 1
     normalise(out, n)
     return n

@@ -99,7 +99,7 @@ def end_along(
 
 @jit
 def regrow(
-    image: Image, ranks: tuple[int, int], circle: Floats, focal: float, middle: float, out: Floats
+    image: Image, ranks: tuple[int, int], circle: Floats, middle: float, out: Floats
 ) -> bool:
     """Fill the circle (3,) around the surface in a circle, by where it ends; False if unknown.
 
@@ -107,11 +107,10 @@ def regrow(
         image: As in `look`.
         ranks: Of the circle, and of none.
         circle: (3,) x, y, radius, px.
-        focal: Focal length, px.
         middle: Depth of the surface, m.
         out: (3,) out.
     """
-    size, n = circle[2] * middle / focal, 0
+    size, n = circle[2] * middle / image.focal, 0
     gate = (middle - 0.8 * size, middle + 1.3 * size, JUMP * size)
     ends = np.empty((2, DIRECTIONS))
     for j in range(DIRECTIONS):

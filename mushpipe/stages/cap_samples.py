@@ -17,6 +17,7 @@ from mushpipe.stages.cap_blocks import (
     GRID,
     SPREAD,
     Cut,
+    Image,
     K,
     Sensor,
     U,
@@ -49,9 +50,8 @@ EAST, SOUTH = np.cos(_TURN).astype(np.float32), np.sin(_TURN).astype(np.float32)
 def sample_depth(
     window: Window,
     cut: Cut,
-    rays: Singles,
+    image: Image,
     circle: Floats,
-    focal: float,
     sensor: Sensor,
     out: Singles,
 ) -> tuple[int, int, float]:
@@ -60,9 +60,8 @@ def sample_depth(
     Args:
         window: From `own_depth`, whose depth is in `cut`.
         cut: Room.
-        rays: (H, W, 2) rays at z = 1, beyond 1e3 where a pixel has none.
+        image: What the window was cut out of.
         circle: (3,) x, y, radius, px.
-        focal: Focal length, px.
         sensor: What took the depth.
         out: (6, M) out: x and y of the ray at z = 1, 1; z and its sigma (m), share that counts as
             independent.
@@ -77,7 +76,7 @@ def sample_depth(
     middle = middle_depth(cut, half, CORE)
     if middle <= 0.0:
         return 0, 0, 0.0
-    size = radius * middle / focal
+    size = radius * middle / image.focal
     low, high, least = middle - 0.8 * size, middle + size, enough(half)
     step = (0.6 * size * (2 * half + 1) / radius) ** 2
     n, other = 0, 0
@@ -92,7 +91,7 @@ def sample_depth(
         if not low < z < high:
             other += 1
             continue
-        x, y = place(rays, focal, blocks[j + U * K], blocks[j + V * K])
+        x, y = place(image, blocks[j + U * K], blocks[j + V * K])
         if abs(x) > 1e3:
             continue  # where the lens has none
         out[0, n], out[1, n], out[2, n], out[3, n] = x, y, 1.0, z - sensor.bias
@@ -198,9 +197,8 @@ def follow(
 def sample_edges(
     window: Window,
     own: Singles,
-    rays: Singles,
+    image: Image,
     circle: Floats,
-    focal: float,
     middle: float,
     offset: float,
     room: tuple[Singles, Ints32],
@@ -211,9 +209,8 @@ def sample_edges(
     Args:
         window: From `own_depth`, not empty.
         own: (H W,) its depth.
-        rays: (H, W, 2) rays at z = 1.
+        image: What the window was cut out of.
         circle: (3,) x, y, radius, px.
-        focal: Focal length, px.
         middle: Middle depth of the cap, m.
         offset: How much of its edge the sensor loses, px.
         room: As `state` and `pixels` of `follow`.
@@ -222,7 +219,7 @@ def sample_edges(
     Returns:
         Number of trusted edge rays.
     """
-    size, state = circle[2] * middle / focal, room[0]
+    size, state = circle[2] * middle / image.focal, room[0]
     gate = (middle - 0.8 * size, middle + 0.95 * size)
     follow(window, own, circle, gate, state, room[1])
     n = 0
@@ -232,7 +229,7 @@ def sample_edges(
             continue
         reach = circle[2] * (INNER + (edge + 0.5) * STEP) + offset
         x, y = circle[0] + reach * COMPASS[j, 0], circle[1] + reach * COMPASS[j, 1]
-        touch(out, n, place(rays, focal, x, y), EDGE_PX * middle / focal, EDGE_SHARE)
+        touch(out, n, place(image, x, y), EDGE_PX * middle / image.focal, EDGE_SHARE)
         n += 1
     return n
 
@@ -270,23 +267,17 @@ def normalise(rays: Singles, count: int) -> None:
 
 
 @borrower
-def place(rays: Singles, focal: float, x: float, y: float) -> tuple[float, float]:
-    """Return the ray at z = 1 of a place in the image (px); outside of it, as without distortion.
-
-    Args:
-        rays: (H, W, 2) of all pixels.
-        focal: Focal length, px.
-        x: px.
-        y: px.
-    """
+def place(image: Image, x: float, y: float) -> tuple[float, float]:
+    """Return the ray at z = 1 of a place in an image (px); outside of it, as without distortion."""
+    rays, focal = image.rays, image.focal
     v = min(max(int(np.floor(y + 0.5)), 0), rays.shape[0] - 1)
     u = min(max(int(np.floor(x + 0.5)), 0), rays.shape[1] - 1)
     return rays[v, u, 0] + (x - u) / focal, rays[v, u, 1] + (y - v) / focal
 
 
 @borrower
-def ray_at(rays: Singles, focal: float, x: float, y: float) -> Vector:
-    """Return the unit ray of a place in the image; arguments as `place`."""
-    rx, ry = place(rays, focal, x, y)
+def ray_at(image: Image, x: float, y: float) -> Vector:
+    """Return the unit ray of a place in an image; arguments as `place`."""
+    rx, ry = place(image, x, y)
     length = np.sqrt(1.0 + rx * rx + ry * ry)
     return rx / length, ry / length, 1.0 / length

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -68,10 +68,21 @@ class Noise(NamedTuple):
     usual: float
 
 
+class Upright(NamedTuple):
+    """How caps stand: the unit vector up, and the spread of tilts off it per direction, rad."""
+
+    up: Vector
+    spread: float
+
+
+System = tuple[Floats, Floats]  # normal matrix (8, 8) and gradient (8,)
+Work = tuple[System, Singles, Singles, Singles]  # from `workspace`
+
+
 @borrower
 def weigh(
-    rows: Floats, rays: Singles, count: int, noise: Any, pixel: float, radius: float, step: int,
-    weights: Floats,
+    rows: Singles, rays: Singles, count: int, noise: Noise, pixel: float, radius: float, step: int,
+    weights: Singles,
 ) -> tuple[float, float]:  # fmt: skip
     """Fill the weights (M,) of the rows of a cap's rays.
 
@@ -117,7 +128,7 @@ def weigh(
 
 
 @borrower
-def weigh_circle(rows: Floats, variance: float, cut: float, weights: Floats) -> None:
+def weigh_circle(rows: Singles, variance: float, cut: float, weights: Singles) -> None:
     """Put the detected circle's three numbers in the place of its rays' rows, the first ROUND.
 
     Mean, cosine and sine of the rays' distance to the cap: they touch it on average; single ones
@@ -147,7 +158,7 @@ def tilt(cap: Floats, up: Vector) -> tuple[float, float]:
 
 
 @borrower
-def add_priors(cap: Floats, upright: tuple[Vector, float], noise: Any, system: Any) -> None:
+def add_priors(cap: Floats, upright: Upright, noise: Noise, system: System) -> None:
     """Add what is known of any cap: aspect, bulge, and that it grows upwards, more or less."""
     normal, gradient = system
     weight = 1.0 / (noise.aspect_sigma * cap[RADIUS]) ** 2
@@ -157,10 +168,10 @@ def add_priors(cap: Floats, upright: tuple[Vector, float], noise: Any, system: A
     normal[6, 6] += weight
     gradient[5] -= noise.aspect * off
     gradient[6] += off
-    lean = tilt(cap, upright[0])
+    lean = tilt(cap, upright.up)
     for w in range(2):
-        normal[3 + w, 3 + w] += 1.0 / upright[1] ** 2
-        gradient[3 + w] += lean[w] / upright[1] ** 2
+        normal[3 + w, 3 + w] += 1.0 / upright.spread**2
+        gradient[3 + w] += lean[w] / upright.spread**2
     normal[7, 7] += 1.0 / noise.bulge_sigma**2
     gradient[7] += (cap[BULGE] - noise.bulge) / noise.bulge_sigma**2
 
@@ -184,7 +195,7 @@ def limit(cap: Floats, step: Floats, size: float) -> None:
 
 
 @jit
-def workspace() -> Any:
+def workspace() -> Work:
     """Return normal matrix (8, 8) and gradient (8,), rows flat and not, and weights (ROOM,)."""
     system = (np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS))
     flat = np.zeros(14 * ROOM, np.float32)
@@ -206,11 +217,11 @@ def refine(
     cap: Floats,
     rays: Singles,
     count: int,
-    upright: tuple[Vector, float],
-    settings: tuple[Any, float, float],
+    upright: Upright,
+    settings: tuple[Noise, float, float],
     first: int,
     last: int,
-    work: Any,
+    work: Work,
 ) -> tuple[float, float]:
     """Take Gauss-Newton steps, and leave the last one's normal matrix, factored, in `work`.
 
@@ -218,7 +229,7 @@ def refine(
         cap: (15,) the estimate, in and out.
         rays: (6, M) as in `weigh`; the first ROUND lie around the detected circle.
         count: How many columns are rays.
-        upright: Unit vector and the spread of tilts off it, rad.
+        upright: How caps stand.
         settings: `Noise`, the angle of a pixel (rad), and the size of the circle at the cap (m).
         first: Number of the first step.
         last: Past the last.

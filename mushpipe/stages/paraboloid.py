@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from mushpipe.core.arrays import Floats, Ints, Rows
@@ -12,6 +10,7 @@ from mushpipe.stages.cap_blocks import (
     CELLS,
     DEPTH,
     SPREAD,
+    Cut,
     Image,
     K,
     U,
@@ -45,7 +44,6 @@ def fit_surfaces(
     discs: Floats,
     rank: Ints,
     rows: Rows,
-    focal: float,
     noise: tuple[float, float],
     least: int,
     out: tuple[Floats, Floats],
@@ -59,7 +57,6 @@ def fit_surfaces(
         discs: (N, 3) x, y, radius, px.
         rank: (N,) of them, as `ranks` from `by_depth`.
         rows: (M,) which of them are fitted.
-        focal: Focal length, px.
         noise: Sigma of depth is noise[0] + noise[1] z, m.
         least: Fewest points.
         out: Coefficients (M, 7) m and covariances (M, 7, 7); those without a fit stay as they are.
@@ -73,8 +70,8 @@ def fit_surfaces(
     seen = np.zeros((len(rows), 2), np.int64)
     for k in range(len(rows)):
         i = rows[k]
-        n, middle = sample_inner(image, rank[i], discs[i], focal, noise, cut, near)
-        size = discs[i, 2] * middle / focal
+        n, middle = sample_inner(image, rank[i], discs[i], noise, cut, near)
+        size = discs[i, 2] * middle / image.focal
         if n >= least and paraboloid(near, n, size, weighted, out[0][k], out[1][k]):
             if not abs(out[0][k, 0]) < min(FARTHEST * size, middle):
                 out[0][k], out[1][k] = np.nan, np.nan
@@ -87,7 +84,7 @@ def fit_surfaces(
 
 @borrower
 def sample_inner(
-    image: Image, rank: int, disc: Floats, focal: float, noise: tuple[float, float], cut: Any,
+    image: Image, rank: int, disc: Floats, noise: tuple[float, float], cut: Cut,
     out: Floats,
 ) -> tuple[int, float]:  # fmt: skip
     """Take block means on a grid in the inner part of a circle; arguments as `fit_surfaces`.
@@ -96,7 +93,6 @@ def sample_inner(
         image: Where they are taken.
         rank: This circle's.
         disc: (3,) x, y, radius, px.
-        focal: Focal length, px.
         noise: Sigma of depth.
         cut: From `room_to_cut`.
         out: (9, M) out: the seven terms of the surface, depth about the middle (m), variance.
@@ -105,12 +101,12 @@ def sample_inner(
         Number of points, and the middle depth (m), 0 without any.
     """
     half, blocks = half_width(disc[2]), cut.blocks
-    average(own_depth(image.depth, image.ranks, rank, disc, 1.0, cut.own), disc, half, cut)
+    average(own_depth(image, rank, disc, 1.0, cut.own), disc, half, cut)
     middle = middle_depth(cut, half, DISC * DISC)
     if middle <= 0.0:
         return 0, 0.0
-    center = ray_at(image.rays, focal, disc[0], disc[1])
-    size = disc[2] * middle / focal
+    center = ray_at(image, disc[0], disc[1])
+    size = disc[2] * middle / image.focal
     sigma = noise[0] + noise[1] * middle
     even = (2.5 * sigma) ** 2 + (0.6 * size * (2 * half + 1) / disc[2]) ** 2
     m = 0
@@ -120,11 +116,11 @@ def sample_inner(
             continue
         if blocks[j + SPREAD * K] > even or not middle - 0.8 * size < z < middle + size:
             continue
-        ray = ray_at(image.rays, focal, blocks[j + U * K], blocks[j + V * K])
+        ray = ray_at(image, blocks[j + U * K], blocks[j + V * K])
         if ray[2] < 1e-3:
             continue  # where the lens has none
-        x = (ray[0] / ray[2] - center[0] / center[2]) * focal / disc[2]
-        y = (ray[1] / ray[2] - center[1] / center[2]) * focal / disc[2]
+        x = (ray[0] / ray[2] - center[0] / center[2]) * image.focal / disc[2]
+        y = (ray[1] / ray[2] - center[1] / center[2]) * image.focal / disc[2]
         out[0, m], out[1, m], out[2, m] = 1.0, x, y
         out[3, m], out[4, m], out[5, m] = x * x, x * y, y * y
         out[TIP, m] = np.sqrt(x * x + y * y + BLUNT * BLUNT) - BLUNT

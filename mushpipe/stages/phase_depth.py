@@ -144,7 +144,7 @@ def relief_of(frame: RgbdFrame) -> Relief:
     plane = fit_plane(far_cells(depth, GRID))
     if plane is None:
         return NO_RELIEF
-    height, focal = _heights(depth, plane), (frame.camera.fx + frame.camera.fy) / 2
+    height, focal = _heights(depth, plane), frame.camera.focal
     known = depth[depth > 0]
     pixel = float(np.median(known[:: max(1, len(known) // 2000)])) / focal
     return Relief(height, closed(height), plane, focal, pixel)

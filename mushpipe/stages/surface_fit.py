@@ -59,8 +59,7 @@ class SurfaceFit(Stage):
         discs = discs_of(circles)
         noise = (self.depth_noise_mm / 1000, self.depth_noise_per_m / 1000)
         surface, covariance, seen = fit_tops(depth, camera, discs, noise, self.min_points)
-        focal = (camera.fx + camera.fy) / 2
-        pixel = self.circle_sigma_px * surface[:, 0] / focal  # its sigma on the cap, m
+        pixel = self.circle_sigma_px * surface[:, 0] / camera.focal  # its sigma on the cap, m
         size = radii_on_rays(circles, camera) * surface[:, 0]
         smooth = without_tip(surface, covariance)
         ray = camera.deproject(circles.center, np.ones(len(circles)))
@@ -108,13 +107,12 @@ def fit_tops(
         order: From `by_depth`, if that is known.
     """
     rank, ranks = order or by_depth(depth, discs)
-    image = Image(depth, pixel_rays(camera), ranks)
+    image = Image(depth, pixel_rays(camera), ranks, camera.focal)
     chosen = np.arange(len(discs)) if rows is None else rows
     n = len(chosen)
     surface = np.full((n, COEFFICIENTS), np.nan)
     covariance = np.full((n, COEFFICIENTS, COEFFICIENTS), np.nan)
-    focal = (camera.fx + camera.fy) / 2
-    seen = fit_surfaces(image, discs, rank, chosen, focal, noise, least, (surface, covariance))
+    seen = fit_surfaces(image, discs, rank, chosen, noise, least, (surface, covariance))
     return surface, covariance, seen
 
 

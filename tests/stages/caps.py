@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mushpipe import Camera, Circles, Header, RgbdFrame
+from mushpipe.stages.cap_blocks import Image
+from mushpipe.stages.upright import pixel_rays
 
 CAMERA = Camera(320, 240, 400.0, 400.0, 159.5, 119.5)
 LIP = 0.25
@@ -103,6 +105,12 @@ def frame_from(depth: np.ndarray, gray: np.ndarray, camera: Camera | None = CAME
     color = np.repeat(np.rint(gray * 255).astype(np.uint8)[..., None], 3, axis=2)
     native = np.nan_to_num(depth).astype(np.float32)
     return RgbdFrame(Header(1, 0, "optical"), color, native, 1.0, camera)
+
+
+def image_of(depth: np.ndarray, camera: Camera = CAMERA) -> Image:
+    """Depth as kernels see it, with ranks of a single circle that covers nothing."""
+    nothing = np.ones(depth.shape, np.int16)
+    return Image(depth.astype(np.float32), pixel_rays(camera), nothing, camera.focal)
 
 
 def circle_of(c: Cap, camera: Camera = CAMERA) -> tuple[float, float, float]:

@@ -13,6 +13,7 @@ from mushpipe.stages.cap_blocks import (
     DEPTH,
     HIDDEN,
     SPREAD,
+    Image,
     K,
     U,
     V,
@@ -27,22 +28,23 @@ WIDTH, HEIGHT = 64, 48
 PLACES = st.tuples(st.floats(-10, 74), st.floats(-10, 58), st.floats(4, 30))
 
 
-def scene(seed: int) -> tuple[np.ndarray, np.ndarray]:
+def scene(seed: int) -> Image:
     """Depth with holes, and ranks, of which 0 hides 1."""
     rng = np.random.default_rng(seed)
     depth = rng.uniform(0.4, 0.6, (HEIGHT, WIDTH)).astype(np.float32)
     depth[rng.random(depth.shape) < 0.2] = np.nan
     depth[rng.random(depth.shape) < 0.1] = 0
-    return depth, (rng.random(depth.shape) > 0.2).astype(np.int16)
+    rays, ranks = np.zeros((HEIGHT, WIDTH, 2), np.float32), rng.random(depth.shape) > 0.2
+    return Image(depth, rays, ranks.astype(np.int16), 400.0)
 
 
-def pixel(depth: np.ndarray, ranks: np.ndarray, u: int, v: int) -> float:
+def pixel(image: Image, u: int, v: int) -> float:
     """Depth of a pixel as circle 1 sees it, 0 where missing or outside, HIDDEN behind circle 0."""
     if not (0 <= u < WIDTH and 0 <= v < HEIGHT):
         return 0.0
-    if ranks[v, u] < 1:
+    if image.ranks[v, u] < 1:
         return float(HIDDEN)
-    return float(depth[v, u]) if depth[v, u] > 0 else 0.0
+    return float(image.depth[v, u]) if image.depth[v, u] > 0 else 0.0
 
 
 @settings(deadline=None)
@@ -50,14 +52,14 @@ def pixel(depth: np.ndarray, ranks: np.ndarray, u: int, v: int) -> float:
 def test_blocks_are_the_means_of_their_valid_pixels(
     seed: int, place: tuple[float, float, float], half: int
 ) -> None:
-    depth, ranks = scene(seed)
+    image = scene(seed)
     circle, cut = np.array(place), room_to_cut(HEIGHT, WIDTH)
-    average(own_depth(depth, ranks, 1, circle, 1.45, cut.own), circle, half, cut)
+    average(own_depth(image, 1, circle, 1.45, cut.own), circle, half, cut)
     blocks = cut.blocks.reshape(-1, K)
     for cell, (x, y) in enumerate(CELLS):
         u0, v0 = np.floor(circle[:2] + circle[2] * np.array([x, y]) + 0.5).astype(int)
         seen = [
-            (u, v, pixel(depth, ranks, u, v))
+            (u, v, pixel(image, u, v))
             for v in range(v0 - half, v0 + half + 1)
             for u in range(u0 - half, u0 + half + 1)
         ]
@@ -69,15 +71,13 @@ def test_blocks_are_the_means_of_their_valid_pixels(
             assert blocks[SPREAD, cell] == pytest.approx(valid[:, 2].var(), abs=1e-6)
 
 
-def followed(
-    depth: np.ndarray, ranks: np.ndarray, circle: np.ndarray, j: int, gate: tuple[float, float]
-) -> int:
+def followed(image: Image, circle: np.ndarray, j: int, gate: tuple[float, float]) -> int:
     """The last step of a cap in a direction, -1 where its edge is not to be trusted."""
     best, edge, total, follows = 0.0, -1, 0.0, ""
     for k in range(RADII):
         far = circle[2] * (INNER + k * STEP)
         u, v = np.floor(circle[:2] + far * COMPASS[j] + 0.5).astype(int)
-        z = pixel(depth, ranks, u, v)
+        z = pixel(image, u, v)
         if z == 0:
             total -= 0.15
         elif z < gate[0]:
@@ -101,24 +101,24 @@ def followed(
 def test_edges_are_those_that_single_steps_find(
     seed: int, place: tuple[float, float, float], low: float, high: float
 ) -> None:
-    depth, ranks = scene(seed)
+    image = scene(seed)
     # places between pixels: single precision does not decide which
     circle = np.round(np.array(place), 1) + 0.037
-    own = np.empty(depth.size, np.float32)
-    window = own_depth(depth, ranks, 1, circle, 1.45, own)
+    own = np.empty(image.depth.size, np.float32)
+    window = own_depth(image, 1, circle, 1.45, own)
     state, pixels = np.empty(6 * DIRECTIONS, np.float32), np.empty(DIRECTIONS, np.int32)
     follow(window, own, circle, (low, high), state, pixels)
     rows = state.reshape(6, DIRECTIONS)
     found = np.where(rows[4] > 0, rows[3], -1)
-    expected = [followed(depth, ranks, circle, j, (low, high)) for j in range(DIRECTIONS)]
+    expected = [followed(image, circle, j, (low, high)) for j in range(DIRECTIONS)]
     # at a distance that is half a pixel but for rounding either pixel is right
     assert (found != expected).mean() <= 1 / DIRECTIONS
 
 
 def test_a_circle_beyond_the_image_has_no_depth() -> None:
-    depth, ranks = scene(0)
+    image = scene(0)
     circle, cut = np.array([-500.0, 900.0, 20.0]), room_to_cut(HEIGHT, WIDTH)
-    window = own_depth(depth, ranks, 1, circle, 1.45, cut.own)
+    window = own_depth(image, 1, circle, 1.45, cut.own)
     average(window, circle, 1, cut)
     assert window.width * window.height == 0
     assert not cut.blocks[:K].any()

@@ -13,8 +13,7 @@ from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.cap_model import SIZE, span
 from mushpipe.stages.cap_outline import LANES_ROOM
 from mushpipe.stages.cap_samples import COMPASS, DIRECTIONS
-from mushpipe.stages.upright import pixel_rays
-from tests.stages.caps import CAMERA, Cap, cap, circle_of, circles_of, draw, frame_from
+from tests.stages.caps import CAMERA, Cap, cap, circle_of, circles_of, draw, frame_from, image_of
 
 ROOM = (np.empty(LANES_ROOM, np.float32), np.empty(2 * DIRECTIONS, np.int32))
 
@@ -58,7 +57,9 @@ def test_a_cap_that_the_image_does_not_show_has_the_circle_of_its_outline(
     true = cap(tilt, 70, place, 0.022, 0.7)
     outline = np.array(circle_of(true, camera))
     circle = outline + np.array([2.0, -1.5, 3.0])
-    improve(circle, parameters(true), (16.0, 0.0), 1.0, pixel_rays(camera), camera.fx, ROOM)
+    improve(
+        circle, parameters(true), (16.0, 0.0), 1.0, image_of(np.zeros((240, 320)), camera), ROOM
+    )
     assert np.abs(circle - outline).max() < 0.2
 
 
@@ -91,10 +92,11 @@ def test_the_image_has_the_say_where_it_shows_all_of_an_outline() -> None:
 def test_a_cap_that_nothing_holds_does_not_move_its_circle() -> None:
     true = cap(0, 0, (0, 0, 0.4), 0.022, 0.55)
     moved = []
+    image = image_of(np.zeros((240, 320)))
     detected = np.array(circle_of(true)) + np.array([3.0, 0.0, 0.0])
     for held, doubt in (((16.0, 0.0), 1.0), ((16.0, 0.0), 3.0), ((4.0, 0.0), 1.0)):
         circle = detected.copy()
-        improve(circle, parameters(true), held, doubt, pixel_rays(CAMERA), CAMERA.fx, ROOM)
+        improve(circle, parameters(true), held, doubt, image, ROOM)
         moved.append(float(np.linalg.norm(circle[:2] - detected[:2])))
     assert moved[0] == pytest.approx(3.0, abs=0.15)
     assert moved[1] < 1.1

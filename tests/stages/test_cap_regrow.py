@@ -12,17 +12,14 @@ from mushpipe.stages.cap_linear import solve3
 from mushpipe.stages.cap_model import SIZE, span
 from mushpipe.stages.cap_regrow import denials, regrow
 from mushpipe.stages.cap_samples import DIRECTIONS
-from mushpipe.stages.upright import pixel_rays
-from tests.stages.caps import CAMERA, cap, circles_of, draw, frame_from
+from tests.stages.caps import cap, circles_of, draw, frame_from, image_of
 
 BED = 0.44
 LOW = cap(15, 60, (0, 0, 0.4), 0.022, 0.55)
 
 
 def seen(*caps: object) -> Image:
-    """Caps, with ranks of a single circle that covers nothing."""
-    depth, _ = draw(list(caps), BED)
-    return Image(depth.astype(np.float32), pixel_rays(CAMERA), np.ones(depth.shape, np.int16))
+    return image_of(draw(list(caps), BED)[0])
 
 
 @given(st.integers(0, 2**31))
@@ -44,7 +41,7 @@ def test_a_surface_is_followed_to_where_it_ends(wrong: tuple[float, float, float
     true = np.append(circles.center[0], circles.radius[0])
     circle = true * [1, 1, wrong[2]] + [wrong[0], wrong[1], 0]
     found = np.empty(3)
-    assert regrow(seen(LOW), (0, 1), circle, CAMERA.fx, 0.395, found)
+    assert regrow(seen(LOW), (0, 1), circle, 0.395, found)
     assert np.abs(found - true).max() < 1.0
 
 
@@ -53,7 +50,7 @@ def test_a_surface_without_an_end_gives_no_circle() -> None:
     endless = image._replace(depth=np.where(image.depth < BED, image.depth, np.float32(0)))
     circles = circles_of([LOW])
     circle = np.append(circles.center[0], circles.radius[0])
-    assert not regrow(endless, (0, 1), circle, CAMERA.fx, 0.395, np.empty(3))
+    assert not regrow(endless, (0, 1), circle, 0.395, np.empty(3))
 
 
 def test_depth_denies_a_cap_that_is_too_small_or_too_large_and_no_other() -> None:
