@@ -24,6 +24,7 @@ from mushpipe.stages.cap_blocks import Image, Sensor
 from mushpipe.stages.cap_clod import CLOD_CHANCE, clods
 from mushpipe.stages.cap_gap import EdgeWatch
 from mushpipe.stages.cap_kin import FEWEST, kin_of, unlike
+from mushpipe.stages.cap_model import ASPECT, ASPECT_SIGMA
 from mushpipe.stages.cap_order import Order, by_depth
 from mushpipe.stages.cap_solve import Noise, Upright
 from mushpipe.stages.cap_verify import chances
@@ -150,8 +151,8 @@ class CapFit(Stage):
             shape=0.027,
             outline=0.03,
             circle_px=self.circle_sigma_px,
-            aspect=0.62,
-            aspect_sigma=0.2,
+            aspect=ASPECT,
+            aspect_sigma=ASPECT_SIGMA,
             bulge=0.0,
             bulge_sigma=0.08,
             firm=15.0,

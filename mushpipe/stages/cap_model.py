@@ -28,6 +28,7 @@ Cap = tuple[float, ...]
 Single: Any = np.float32  # to type checkers a float
 Vector = tuple[float, float, float]
 LIP = 0.25  # depth of the margin below the rim plane, in rim radii
+ASPECT, ASPECT_SIGMA = 0.62, 0.2  # height of a dome, in rim radii: what is usual, and its spread
 SIZE = 15
 N, RADIUS, HEIGHT, BULGE, E1, E2 = 3, 6, 7, 8, 9, 12
 LANES = 16  # columns that a kernel works on at once

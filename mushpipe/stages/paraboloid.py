@@ -22,6 +22,7 @@ from mushpipe.stages.cap_blocks import (
     own_depth,
     room_to_cut,
 )
+from mushpipe.stages.cap_model import ASPECT
 from mushpipe.stages.cap_samples import ray_at
 
 COEFFICIENTS = 7
@@ -31,7 +32,6 @@ DISC = 0.7  # points within so many radii; farther out a cap falls off faster th
 EFFECTIVE = 0.5  # as in cap-fit: so much of a point's information is its own
 SHAPE_M = 0.00025  # sigma of a cap about such a surface
 BEND = 0.3  # sigma of the quadratic coefficients about those of a cap, in radii
-ASPECT = 0.62  # height of a dome over the radius of its rim
 POINTED = 0.2  # sigma of the slope of a pointed top, less in its innermost BLUNT radii
 BLUNT = 0.15
 FARTHEST = 2.0  # radii from the middle depth to a top; a hole's rim may suggest more

@@ -11,6 +11,7 @@ from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.phase_thin import thin
 
 SIGMA = 1.1
+TOP = 64.0  # gray levels per px; larger gradients count as this in Otsu's threshold
 DEPTH_ALONE = 0.6  # weight of a depth edge without a gray one
 # Between two caps the steepest step lies within the shaded rim, not on the outline. How far within
 # depends on how bright it is outside, over inside: fitted to the simulator's outlines.
@@ -97,10 +98,10 @@ def gradient_of(image: Singles) -> Gradient:
 
 
 @jit
-def otsu_of(size: Singles, top: float) -> float:
-    """Return Otsu's threshold (1979) of the values at every second pixel, in 256 bins to `top`."""
+def otsu_of(size: Singles) -> float:
+    """Return Otsu's threshold (1979) of the values at every second pixel, in 256 bins to `TOP`."""
     bins = np.zeros(256, np.int64)
-    scale = np.float32(256 / top)
+    scale = np.float32(256 / TOP)
     for y in range(0, size.shape[0], 2):
         for x in range(0, size.shape[1], 2):
             bins[min(255, int(size[y, x] * scale))] += 1

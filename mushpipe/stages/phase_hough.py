@@ -40,7 +40,6 @@ from mushpipe.stages.warm_up import example_circles, example_frame
 Positive = Annotated[float, Field(gt=0)]
 
 _FLOOR = 4.0  # gray levels per px; Otsu's threshold of an image without edges is noise
-_TOP = 64.0  # gray levels per px; larger gradients count as this in Otsu's threshold
 _AROUND = np.ones((7, 7), np.uint8)  # edges are taken so far around the foreground
 _STANDING = 0.004  # m; what is higher than this over the bed is looked at, in the mask or not
 EVIDENCE = 0.07  # share of an outline that votes; half-hidden caps show hardly more
@@ -244,7 +243,7 @@ class PhaseHough(Stage):
         return Radii(smallest, min(largest, max(height, width) / 2))
 
     def _edges(self, image: Singles, gradient: Gradient, region: Bytes, relief: Relief) -> Strips:
-        otsu = max(otsu_of(gradient.size, _TOP), _FLOOR)
+        otsu = max(otsu_of(gradient.size), _FLOOR)
         edges, pixels = edges_of(image, gradient, region, self.edge * otsu, 1.2 * otsu)
         if relief.known:
             edges = fused(edges, pixels, relief.edges(), CELL)

@@ -11,15 +11,14 @@ from mushpipe.core.geometry import lengths
 from mushpipe.core.jit import borrower
 from mushpipe.stages.calibrated import calibration_of
 from mushpipe.stages.cap_blocks import CELLS, Image
+from mushpipe.stages.cap_model import ASPECT, ASPECT_SIGMA, LIP
 from mushpipe.stages.cap_order import Order, by_depth
 from mushpipe.stages.cap_samples import ASTRAY
 from mushpipe.stages.discs import discs_of, radii_on_rays
-from mushpipe.stages.paraboloid import ASPECT, COEFFICIENTS, SHAPE_M, TIP, fit_surfaces
+from mushpipe.stages.paraboloid import COEFFICIENTS, SHAPE_M, TIP, fit_surfaces
 from mushpipe.stages.upright import pixel_rays
 from mushpipe.stages.warm_up import example_circles, example_frame
 
-ASPECT_SIGMA = 0.2  # as in cap-fit
-LIP = 0.25  # what is below the rim's plane, over its radius
 OUTLINE = 0.008  # sigma of a cap's diameter about that of its outline, relative
 WHOLE = 0.85  # share of the grid that finds depth on a cap which nothing hides
 STEEPEST = np.radians(60)

@@ -84,7 +84,7 @@ def test_an_edge_between_bright_surfaces_is_moved_outwards() -> None:
 def test_otsu_of_two_levels_lies_between_them() -> None:
     size = np.full((20, 20), 2.0, np.float32)
     size[:10] = 20
-    assert 2 < otsu_of(size, 64.0) < 20
+    assert 2 < otsu_of(size) < 20
 
 
 def test_phases_of_the_smallest_and_largest_radius_leave_a_gap() -> None:
