@@ -12,9 +12,9 @@ from mcap.reader import make_reader
 
 from mushpipe.core.errors import EXIT_DAMAGED, EXIT_FAILED, EXIT_USAGE
 from mushpipe.core.recording import RecordingReader
+from tests.cli.shell import GRAPH, ROOT, mushpipe
 from tests.io.values import make_frame, make_picks, record, trace_of
 
-ROOT = Path(__file__).parents[2]
 PICK_KEYS = [
     "id",
     "u",
@@ -32,30 +32,6 @@ PICK_KEYS = [
     "depth_source",
     "flags",
 ]
-GRAPH = """\
-mushpipe: 1
-source: {use: synthetic, max_frames: 3, count: 12}
-stages:
-  segment: {use: otsu}
-  open:    {use: opening}
-  detect:  {use: hough}
-  locate:  {use: nearest-depth}
-  pick:    {use: picks}
-sinks:
-  log: {use: mcap, path: out.mcap}
-"""
-
-
-def mushpipe(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    code = "from mushpipe.cli import main; main()"
-    command = [sys.executable, "-c", code, *map(str, arguments)]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    (tmp_path / "graph.yaml").write_text(GRAPH)
-    return tmp_path
 
 
 def test_run_writes_results_and_manifest_and_prints_the_balance(folder: Path) -> None:

@@ -5,13 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from mushpipe import Camera, Header, RgbdFrame
 from mushpipe.core import wire
 from mushpipe.core.errors import EXIT_DAMAGED, EXIT_OK
 from mushpipe.core.recorder import RecordingWriter
-from tests.cli.test_commands import GRAPH, mushpipe
+from tests.cli.shell import mushpipe
 from tests.stages.scenes import discs
 
 CAMERA = Camera(160, 120, 200.0, 200.0, 79.5, 59.5)
@@ -31,12 +30,6 @@ def record(path: Path, shapes: list[tuple[int, int]], depth: bool, camera: Camer
         else:  # a recorder that says nothing of another size
             writer.write(wire.COLOR_TOPIC, wire.encode_color(frame), header)
     writer.close()
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    (tmp_path / "graph.yaml").write_text(GRAPH)
-    return tmp_path
 
 
 def test_depth_without_calibration_ends_the_run(folder: Path) -> None:

@@ -9,7 +9,6 @@ import resource
 import signal
 import struct
 import subprocess
-import sys
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -24,12 +23,11 @@ from mushpipe import Camera, Header, RgbdFrame
 from mushpipe.core.errors import EXIT_FAILED, EXIT_USAGE, InputError
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.sources.mcap import McapSource
-from tests.cli.test_commands import mushpipe
+from tests.cli.shell import MAIN, mushpipe
 from tests.core.lab import PATIENCE_S
 
 CAMERA = Camera(160, 120, 154.0, 154.5, 80.2, 59.7)
 IMAGES = 23
-MAIN = [sys.executable, "-c", "from mushpipe.cli import main; main()"]
 CHUNK = 2**20
 
 

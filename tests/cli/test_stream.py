@@ -19,8 +19,8 @@ from mushpipe.core.recording import RecordingReader
 from mushpipe.core.truth import INSTANCES_TOPIC, TRUTH_TOPIC
 from mushpipe.core.wire import COLOR_TOPIC
 from mushpipe.sources.mcap import McapSource
-from tests.cli.test_commands import ROOT, mushpipe
-from tests.cli.test_record import MAIN, PATIENCE_S
+from tests.cli.shell import MAIN, ROOT, mushpipe
+from tests.core.lab import PATIENCE_S
 
 BED = ROOT / "recordings/first-bed.mcap"
 GRAPH = """\

@@ -10,13 +10,7 @@ from mushpipe import RunInfo
 from mushpipe.core.errors import EXIT_USAGE
 from mushpipe.sinks.mcap import McapSink
 from mushpipe.sinks.rerun import RerunSink
-from tests.cli.test_commands import GRAPH, mushpipe
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    (tmp_path / "graph.yaml").write_text(GRAPH)
-    return tmp_path
+from tests.cli.shell import mushpipe
 
 
 def test_a_recording_is_never_written_over_by_its_own_run(folder: Path) -> None:

@@ -19,7 +19,7 @@ from mushpipe.core.report import RunReport
 from mushpipe.core.wire import decode_table
 from mushpipe.sources.mcap import McapSource
 from mushpipe.sources.synthetic import SyntheticSource
-from tests.cli.test_commands import ROOT
+from tests.cli.shell import ROOT
 from tests.core.lab import Lab, held, soon
 from tests.io import bags
 from tests.live.rig import SERIAL, SYSTEM, Rig, acquire

@@ -25,12 +25,12 @@ from mushpipe.core.report import RunReport
 from mushpipe.core.run import run
 from mushpipe.proof.compare import compare
 from mushpipe.sources.mcap import McapSource
+from tests.cli.shell import MAIN
 
 ROOT = Path(__file__).parents[2]
 PICK = ROOT / "graphs/pick.yaml"
 FIRST_BED = ROOT / "recordings/first-bed.mcap"
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
-CLI = [sys.executable, "-c", "from mushpipe.cli import main; main()"]
 
 
 class Keep(Sink):
@@ -186,7 +186,7 @@ def test_a_full_disk_ends_the_run_in_words(tmp_path: Path) -> None:
 
 
 def start(log: Path, *options: str, **environment: str) -> subprocess.Popen[bytes]:
-    command = [*CLI, "run", str(PICK), "--set", f"log.path={log}", *options]
+    command = [*MAIN, "run", str(PICK), "--set", f"log.path={log}", *options]
     return subprocess.Popen(
         command, env={**ENVIRONMENT, **environment}, stderr=subprocess.PIPE, cwd=log.parent
     )

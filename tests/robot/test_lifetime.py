@@ -16,12 +16,12 @@ from typing import Any
 import pytest
 
 from mushpipe.robot.client import RobotClient
+from tests.cli.shell import MAIN
 from tests.robot.peer import Peer
 from tests.robot.scene import bench
 
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
-CLI = [sys.executable, "-c", "from mushpipe.cli import main; main()"]
 
 
 @contextmanager
@@ -64,7 +64,7 @@ def test_the_server_is_killed_and_comes_back() -> None:
 def test_the_reference_client_is_killed_and_comes_back() -> None:
     with bench() as b:
         b.publish()
-        command = [*CLI, "robot", "client", f"127.0.0.1:{b.port}", "--raw", "--mode", "stream"]
+        command = [*MAIN, "robot", "client", f"127.0.0.1:{b.port}", "--raw", "--mode", "stream"]
         with process(*command) as child:
             assert child.stdout
             while json.loads(child.stdout.readline())["op"] != "targets":

@@ -107,6 +107,11 @@ def frame_from(depth: np.ndarray, gray: np.ndarray, camera: Camera | None = CAME
     return RgbdFrame(Header(1, 0, "optical"), color, native, 1.0, camera)
 
 
+def angle(a: np.ndarray, b: np.ndarray) -> float:
+    """Degrees between two unit vectors."""
+    return float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))
+
+
 def image_of(depth: np.ndarray, camera: Camera = CAMERA) -> Image:
     """Depth as kernels see it, with ranks of a single circle that covers nothing."""
     nothing = np.ones(depth.shape, np.int16)

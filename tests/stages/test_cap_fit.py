@@ -14,6 +14,7 @@ from mushpipe.stages.upright import pixel_rays, upright
 from tests.stages.caps import (
     CAMERA,
     Cap,
+    angle,
     cap,
     circle_around,
     circles_of,
@@ -23,10 +24,6 @@ from tests.stages.caps import (
 )
 
 EXACT = {"depth_noise_mm": 0.02, "depth_noise_per_m": 0.0, "edge_offset_px": 0.0, "tilt_deg": 60}
-
-
-def angle(a: np.ndarray, b: np.ndarray) -> float:
-    return float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))
 
 
 def fit(caps: list[Cap], **more: object) -> tuple[Locations, Poses]:

@@ -9,12 +9,13 @@ from mushpipe import Circles, DepthSource, InputError, RgbdFrame
 from mushpipe.stages.cap_fit import CapFit
 from tests.stages.caps import (
     CAMERA,
+    angle,
     cap,
     circles_of,
     draw,
     frame_from,
 )
-from tests.stages.test_cap_fit import angle, fit
+from tests.stages.test_cap_fit import fit
 
 ONE = Circles([[160.0, 120.0]], [20.0], [1.0])
 

@@ -52,7 +52,9 @@ def test_discs_fit_into_what_stands_and_touch_its_border(seed: int) -> None:
         (x, y), r = rng.uniform(40, (280, 200)), rng.uniform(12, 40)
         height = np.maximum(height, disc(x, y, r, rng.uniform(0.002, 0.06)))
     v, u = np.mgrid[:HEIGHT, :WIDTH]
-    for x, y, r, _ in blobs_of(relief(height), Radii(8, 60)):
+    found = blobs_of(relief(height), Radii(8, 60))
+    assert len(found)
+    for x, y, r, _ in found:
         away = np.hypot(2 * u + 0.5 - x, 2 * v + 0.5 - y)
         to_lower = [away[height <= level].min() for level in LEVELS]
         assert np.abs(np.array(to_lower) - r).min() <= EXACT

@@ -9,7 +9,7 @@ from mushpipe.core.errors import DependencyError
 from mushpipe.stages.nearest_depth import NearestDepth
 from mushpipe.stages.registration import Registration
 from mushpipe.stages.upright_model import made, read
-from tests.stages.caps import cap, circles_of, draw, frame_from
+from tests.stages.caps import angle, cap, circles_of, draw, frame_from
 
 try:
     from mushpipe.core.libraries import import_open3d
@@ -37,10 +37,6 @@ def seen(tilt: float, turn: float, noise: float = 0.0) -> tuple[np.ndarray, np.n
     points = points[normals[:, 2] < -0.2] + [0.03, -0.02, 0.4]
     points = points + np.random.default_rng(0).normal(0, noise, points.shape)
     return points, (flip * lean).apply([0, 0, 1])
-
-
-def angle(a: np.ndarray, b: np.ndarray) -> float:
-    return float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))
 
 
 @pytest.mark.parametrize("local", ["point-to-point", "point-to-plane"])

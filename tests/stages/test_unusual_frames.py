@@ -98,6 +98,7 @@ def test_outlines_stay_within_a_tenth_of_the_range(limits: tuple[float, float]) 
     for name in ("first-bed", "dense", "tilted"):
         frame = first(name)
         found = PhaseHough(radius_px=limits, min_score=0.2).process(frame, everything(frame))
+        assert len(found)
         assert (found.radius >= 0.9 * limits[0]).all()
         assert (found.radius <= 1.12 * limits[1]).all()  # of equal area: ovals are a little larger
 

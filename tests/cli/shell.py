@@ -1,0 +1,27 @@
+"""The program in a process of its own, as a shell starts it, and a graph for it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+MAIN = [sys.executable, "-c", "from mushpipe.cli import main; main()"]
+GRAPH = """\
+mushpipe: 1
+source: {use: synthetic, max_frames: 3, count: 12}
+stages:
+  segment: {use: otsu}
+  open:    {use: opening}
+  detect:  {use: hough}
+  locate:  {use: nearest-depth}
+  pick:    {use: picks}
+sinks:
+  log: {use: mcap, path: out.mcap}
+"""
+
+
+def mushpipe(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
+    command = [*MAIN, *map(str, arguments)]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
