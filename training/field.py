@@ -17,7 +17,7 @@ import numpy as np
 from mushpipe import Circles, Mask, RgbdFrame
 from mushpipe.core.arrays import Floats
 from mushpipe.core.truth import Ignore
-from mushpipe.evaluate.matching import circle_iou
+from mushpipe.evaluate.matching import assign, circle_iou
 from mushpipe.evaluate.truth import read_truth
 from mushpipe.sources.mcap import McapSource
 from mushpipe.stages.phase_hough import PhaseHough
@@ -51,14 +51,11 @@ def labelled_frames(path: Path) -> Iterator[tuple[RgbdFrame, Floats, Floats]]:
 
 def found_and_false(circles: Circles, must: Floats, may: Floats) -> tuple[int, int]:
     """Return how many of the circles (N, 3) that must be found are, and how many others are."""
-    from scipy.optimize import linear_sum_assignment
-
     iou = circle_iou(circles.center, circles.radius, must[:, :2], must[:, 2])
-    rows, columns = linear_sum_assignment(np.where(iou >= IOU, -iou, 1.0))
-    good = iou[rows, columns] >= IOU
-    left = np.setdiff1d(np.arange(len(circles)), rows[good])
+    rows, _ = assign(iou, IOU)
+    left = np.setdiff1d(np.arange(len(circles)), rows)
     away = np.linalg.norm(circles.center[left][:, None] - may[None, :, :2], axis=2)
-    return int(good.sum()), int((~(away <= may[None, :, 2]).any(axis=1)).sum())
+    return len(rows), int((~(away <= may[None, :, 2]).any(axis=1)).sum())
 
 
 def result(circles: Circles, must: Floats, may: Floats) -> str:

@@ -1,16 +1,15 @@
-"""Which circle is which cap: exact circle IoU of at least 0.5, Hungarian, ignored ones neutral."""
+"""Which circle is which cap: exact circle IoU of at least 0.5, ignored ones neutral."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from mushpipe import Circles
 from mushpipe.core.arrays import Bools, Floats, Rows
 from mushpipe.core.truth import Truth
-from mushpipe.evaluate.matching import circle_iou
+from mushpipe.evaluate.matching import assign, circle_iou
 
 IOU = 0.5
 
@@ -28,10 +27,8 @@ def matched(iou: Floats, counts: Bools) -> tuple[Rows, Rows]:
         iou: (N, M).
         counts: (M,) which caps must be found.
     """
-    rows, columns = linear_sum_assignment(np.where(iou[:, counts] >= IOU, -iou[:, counts], 1.0))
-    columns = np.flatnonzero(counts)[columns]
-    good = iou[rows, columns] >= IOU
-    return rows[good], columns[good]
+    rows, columns = assign(iou[:, counts], IOU)
+    return rows, np.flatnonzero(counts)[columns]
 
 
 @dataclass

@@ -139,7 +139,7 @@ class PhaseHough(Stage):
         self._warm_up()
 
     def process(self, frame: RgbdFrame, mask: Mask, learned: Circles | None = None) -> Circles:
-        """Return the circles, the most certain first.
+        """Return the circles in the order they were accepted in; by score beside `learned`.
 
         Args:
             frame: The image, and depth where there is one.
