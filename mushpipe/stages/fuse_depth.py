@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,41 @@ from mushpipe.core.types import end_of_scale
 
 SIGMAS = 4.0  # of depth noise, which the gate lets pass
 PAUSE_NS = 1_000_000_000  # what was seen longer ago is no part of what is seen now
+
+
+class Memory(NamedTuple):
+    """What was seen so far.
+
+    Attributes:
+        mean: (H, W) native, 0 = missing.
+        held: (H, W) how many frames each mean holds.
+        age: (H, W) for how many frames each pixel had no depth.
+    """
+
+    mean: Singles
+    held: Bytes
+    age: Bytes
+
+
+class Gate(NamedTuple):
+    """What is mixed with what was seen before, native.
+
+    Attributes:
+        step: At which a pixel starts anew: at least this,
+        noise: and at least this,
+        growth: plus so many times its depth.
+        end: Where depth ends; from there on it is missing.
+    """
+
+    step: float
+    noise: float
+    growth: float
+    end: float
+
+
+def nothing(shape: tuple[int, ...]) -> Memory:
+    """Return the memory (H, W) of a camera that has seen nothing."""
+    return Memory(np.zeros(shape, np.float32), np.zeros(shape, np.uint8), np.zeros(shape, np.uint8))
 
 
 class FuseDepth(Stage):
@@ -42,9 +77,7 @@ class FuseDepth(Stage):
         description="share, of the pixels with depth before and now, starting anew at which all do",
     )
 
-    _mean: Singles | None = PrivateAttr(None)
-    _count: Bytes | None = PrivateAttr(None)
-    _age: Bytes | None = PrivateAttr(None)
+    _memory: Memory | None = PrivateAttr(None)
     _scale: float = PrivateAttr(0.0)
     _stamp_ns: int = PrivateAttr(0)
 
@@ -53,9 +86,8 @@ class FuseDepth(Stage):
         for dtype in (np.uint16, np.float32):
             depth = np.ones((2, 2), dtype)
             depth.flags.writeable = False
-            state = np.zeros((2, 2), np.float32), np.zeros((2, 2), np.uint8)
-            fuse(depth, *state, np.zeros((2, 2), np.uint8), (1.0, 0.0, 0.0, 9.0), 2)
-        self._mean = None
+            fuse(depth, nothing(depth.shape), Gate(1.0, 0.0, 0.0, 9.0), 2)
+        self._memory = None
 
     def process(self, frame: RgbdFrame) -> RgbdFrame:
         """Return the frame with its mean depth, float32 in the sensor's unit, 0 = missing."""
@@ -65,67 +97,62 @@ class FuseDepth(Stage):
         if depth.dtype == np.float32:
             depth = np.nan_to_num(depth, posinf=0.0, neginf=0.0)
             depth.flags.writeable = False
+        memory = self._memory
         if (
-            self._mean is None
-            or self._mean.shape != depth.shape
+            memory is None
+            or memory.mean.shape != depth.shape
             or self._scale != frame.depth_scale
             or not 0 <= frame.header.stamp_ns - self._stamp_ns <= PAUSE_NS
         ):
-            self._forget(frame)
+            memory = self._forget(frame)
         self._stamp_ns = frame.header.stamp_ns
         noise = SIGMAS * self.depth_noise_mm / 1000 / frame.depth_scale
         growth = SIGMAS * self.depth_noise_per_m / 1000
         end = float(end_of_scale(depth))
-        gate = (self.gate_mm / 1000 / frame.depth_scale, noise, growth, end)
-        fresh, known = fuse(depth, self._mean, self._count, self._age, gate, self.frames)
+        gate = Gate(self.gate_mm / 1000 / frame.depth_scale, noise, growth, end)
+        fresh, known = fuse(depth, memory, gate, self.frames)
         if fresh > self.moved * known:
-            self._forget(frame)
-            fuse(depth, self._mean, self._count, self._age, gate, self.frames)
-        return replace(frame, depth=np.array(self._mean))
+            memory = self._forget(frame)
+            fuse(depth, memory, gate, self.frames)
+        return replace(frame, depth=np.array(memory.mean))
 
-    def _forget(self, frame: RgbdFrame) -> None:
-        shape = frame.color.shape[:2]
-        self._mean, self._scale = np.zeros(shape, np.float32), frame.depth_scale
-        self._count, self._age = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
+    def _forget(self, frame: RgbdFrame) -> Memory:
+        """Return a memory to begin anew with."""
+        self._memory, self._scale = nothing(frame.color.shape[:2]), frame.depth_scale
+        return self._memory
 
 
 @jit
-def fuse(
-    depth: NDArray[Any], mean: Any, count: Any, age: Any,
-    gate: tuple[float, float, float, float], frames: int,
-) -> Any:  # fmt: skip
+def fuse(depth: NDArray[Any], memory: Memory, gate: Gate, frames: int) -> tuple[int, int]:
     """Take one more depth image into a mean.
 
     Args:
         depth: (H, W) native, 0 = missing, finite.
-        mean: (H, W) float32, in and out, 0 = missing.
-        count: (H, W) uint8, in and out, how many frames each mean holds.
-        age: (H, W) uint8, in and out, for how many frames each pixel had no depth.
-        gate: Step at which a pixel starts anew, native: at least the first, and at least the second
-            plus the third times its depth. The fourth is where depth ends, native: from there on
-            it is missing.
+        memory: In and out.
+        gate: What is mixed with it.
         frames: Most frames that a mean holds.
 
     Returns:
         How many pixels started anew, and how many had depth before and have it now.
     """
-    fresh, known = 0, 0
+    (mean, held, age), fresh, known = memory, 0, 0
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
             z = np.float32(depth[v, u])
-            if z <= 0 or z >= gate[3]:
+            if z <= 0 or z >= gate.end:
                 if mean[v, u] > 0:
                     age[v, u] += 1
                     if age[v, u] >= frames:
-                        mean[v, u], count[v, u] = 0, 0
+                        mean[v, u], held[v, u] = 0, 0
                 continue
             age[v, u] = 0
             step = z - mean[v, u]
             known += mean[v, u] > 0
-            if mean[v, u] > 0 and abs(step) <= max(gate[0], gate[1] + gate[2] * mean[v, u]):
-                count[v, u] = min(count[v, u] + 1, frames)
-                mean[v, u] += step / np.float32(count[v, u])
+            widest = max(gate.step, gate.noise + gate.growth * mean[v, u])
+            if mean[v, u] > 0 and abs(step) <= widest:
+                held[v, u] = min(held[v, u] + 1, frames)
+                mean[v, u] += step / np.float32(held[v, u])
             else:
                 fresh += mean[v, u] > 0
-                mean[v, u], count[v, u] = z, 1
+                mean[v, u], held[v, u] = z, 1
     return fresh, known
