@@ -114,11 +114,11 @@ traced: $(STAMP) system-libraries
 	@ldconfig -p | grep -q libLLVM.so.19 || { \
 	  if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
 	    apt-get update -qq && apt-get install -y -qq libllvm19 >/dev/null; \
-	  else echo "note: Mitsuba needs LLVM 15 or newer: sudo apt-get install libllvm19"; fi; }
+	  else echo "note: Mitsuba needs LLVM 16 or newer: sudo apt-get install libllvm19"; fi; }
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[traced]'
-	$(BIN)/python -m training.traced --out $(TRACED)/beds.mcap
-	for graph in pick classic colour; do \
-	  $(BIN)/mushpipe eval graphs/$$graph.yaml --recordings $(TRACED); done
+	$(BIN)/python -m training.traced --out $(TRACED)
+	$(BIN)/python -m training.net.judge --peers --recordings $(TRACED)/*.mcap
+	for graph in pick classic; do $(BIN)/mushpipe eval graphs/$$graph.yaml --recordings $(TRACED); done
 
 # Results every recording is held to; shows what changes.
 .PHONY: goldens

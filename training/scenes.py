@@ -10,6 +10,8 @@ from typing import Any
 
 from mushpipe import RgbdFrame
 from mushpipe.core.truth import TRUTH_TOPIC, Truth
+from mushpipe.evaluate.truth import truth_of_recording
+from mushpipe.sources.mcap import McapSource
 from mushpipe.sources.synthetic import SyntheticSource
 
 CONDITIONS: dict[str, dict[str, Any]] = {
@@ -92,6 +94,17 @@ def stored(path: Path, condition: str, settings: dict[str, Any]) -> Case:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(pickle.dumps(case))
     return case
+
+
+def recorded_cases(path: Path) -> Iterator[Case]:
+    """Yield the frames of a recording that carries its truth; its name is the condition."""
+    source, known = McapSource(path=path), truth_of_recording(path)
+    source.open()
+    for frame in source.frames():
+        place = known.place(frame.header)
+        if place is not None:
+            truth = known.frames[place].caps
+            yield Case(path.stem, "", frame.header.sequence, frame, truth)
 
 
 def training_cases(cache: Path) -> Iterator[Case]:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mushpipe import Circles, Locations, Poses
+from mushpipe.core.arrays import Bools, Floats
 from mushpipe.core.geometry import Camera, lengths
 
 _ONE_CHAIN = (
@@ -36,7 +36,7 @@ def require_plausible(
         _require_size(circles, locations, poses, camera)
 
 
-def _require_in_front(points: NDArray[np.float64], what: str) -> None:
+def _require_in_front(points: Floats, what: str) -> None:
     """Raise ValueError where a point (N, 3) is not before the camera."""
     if (row := _first(points[:, 2] <= 0)) is not None:
         x, y, z = points[row]
@@ -46,7 +46,7 @@ def _require_in_front(points: NDArray[np.float64], what: str) -> None:
         )
 
 
-def _require_same(circles: Circles, seen: NDArray[np.float64], what: str) -> None:
+def _require_same(circles: Circles, seen: Floats, what: str) -> None:
     """Raise ValueError where a point, seen at (N, 2) px, is not seen in its circle."""
     away = np.linalg.norm(seen - circles.center, axis=1) > ASTRAY[what] * circles.radius
     if (row := _first(away)) is not None:
@@ -83,11 +83,11 @@ def _require_size(circles: Circles, locations: Locations, poses: Poses, camera: 
         )
 
 
-def _differ(given: NDArray[np.float64], seen: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _differ(given: Floats, seen: Floats) -> Bools:
     """Return where two lengths (N,) differ as lengths of different units do."""
     return np.asarray((given > UNIT * seen) | (seen > UNIT * given))
 
 
-def _first(wrong: NDArray[np.bool_]) -> int | None:
+def _first(wrong: Bools) -> int | None:
     """Return the first row (N,) that is wrong."""
     return int(np.argmax(wrong)) if wrong.any() else None

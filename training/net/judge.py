@@ -1,7 +1,8 @@
 """Judge `cap-net` beside the classic detector, on what trained neither.
 
 `python -m training.net.judge` prints simulated scenes of both shape families by condition, with
-`--choosing` those for choices of design, and with `--field FOLDER` labelled real recordings.
+`--choosing` those for choices of design, with `--recordings FILE...` recordings that carry their
+truth, and with `--field FOLDER` labelled real ones.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from training import judge
 from training.field import RANGES, labelled_frames, result
 from training.matching import Score, counted
 from training.net.scenes import CHOOSING_SEED, JUDGING_SEED, varied_cases
-from training.scenes import Case, choosing_cases, judging_cases
+from training.scenes import Case, choosing_cases, judging_cases, recorded_cases
 from training.verifier import RADII, segmentations
 
 OPEN = (8.0, None)  # as graphs/pick.yaml has it: the largest radius is left to what is seen
@@ -100,12 +101,15 @@ def main() -> None:
     parser.add_argument("--each", type=int, default=EACH, help="frames of a row per shape family")
     parser.add_argument("--varied", type=int, default=VARIED, help="how many varied frames")
     parser.add_argument("--field", type=Path, help="labelled real recordings instead")
+    parser.add_argument("--recordings", type=Path, nargs="+", help="with truth, instead")
     arguments = parser.parse_args()
     if arguments.field:
         for line in real(arguments.models[0], arguments.field):
             print(line)
     else:
         cases = scenes(arguments.cache, arguments.choosing, arguments.each, arguments.varied)
+        if arguments.recordings:
+            cases = chain.from_iterable(map(recorded_cases, arguments.recordings))
         print(simulated(arguments.models, cases, arguments.peers))
 
 

@@ -1,7 +1,7 @@
-"""Render beds into a recording with truth: `python -m training.traced --out FILE`.
+"""Render beds into two recordings with truth: `python -m training.traced`.
 
-Needs Mitsuba (`pip install -e '.[traced]'`) and LLVM 15 or newer (Debian: `libllvm15`; where it is
-not found, DRJIT_LIBLLVM_PATH names the library). About ten seconds per frame on two cores.
+Needs Mitsuba (`pip install -e '.[traced]'`) and LLVM 16 or newer (Debian: `libllvm19`; where it is
+not found, DRJIT_LIBLLVM_PATH names the library). About 15 seconds per frame on two cores.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ START_NS = 1_700_000_000 * 10**9
 
 
 def frame_of(seed: int, number: int, samples: int) -> RgbdFrame:
-    """Return the frame of a seed, with its truth; every second has depth by stereo."""
+    """Return the frame of a seed, with its truth; odd ones have depth by stereo."""
     rng = np.random.default_rng([seed, 0])
     bed = drawn(rng, np.array([CAMERA.width, CAMERA.height]) / 2 / CAMERA.fx)
     view = traced(bed, CAMERA, samples, seed)
@@ -39,20 +39,20 @@ def frame_of(seed: int, number: int, samples: int) -> RgbdFrame:
 def main() -> None:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("out/traced/traced.mcap"))
-    parser.add_argument("--frames", type=int, default=24)
-    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=Path("out/traced"), help="a folder")
+    parser.add_argument("--frames", type=int, default=12, help="of either kind of depth")
+    parser.add_argument("--first-seed", type=int, default=0, help="an even number")
     parser.add_argument("--samples", type=int, default=32, help="paths per pixel")
     arguments = parser.parse_args()
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    writer = RecordingWriter(arguments.out, {})
-    try:
-        for number in range(arguments.frames):
-            frame = frame_of(arguments.first_seed + number, number, arguments.samples)
-            writer.frame(frame, JPEG_QUALITY)
-    finally:
-        writer.close()
-    print(arguments.out)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    for kind, name in enumerate(("traced-coded", "traced-stereo")):
+        writer = RecordingWriter(arguments.out / f"{name}.mcap", {})
+        try:
+            for number in range(arguments.frames):
+                seed = arguments.first_seed + 2 * number + kind
+                writer.frame(frame_of(seed, number, arguments.samples), JPEG_QUALITY)
+        finally:
+            writer.close()
 
 
 if __name__ == "__main__":

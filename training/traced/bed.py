@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mushpipe.core.arrays import Floats
 from mushpipe.sim.mushroom import turned_to
 from training.traced import things
-from training.traced.mesh import Floats, Mesh, joined
+from training.traced.mesh import Mesh, joined
 
 _TRIES = 60
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from training.traced.mesh import Floats
+from mushpipe.core.arrays import Bools, Floats, Singles
 from training.traced.render import View
 
 OFFSET = 0.00285  # m that both read too far, as graphs/pick.yaml has it corrected
@@ -18,10 +18,8 @@ UNIT = 0.0001  # m
 CODED_BASELINE, STEREO_BASELINE = 0.047, 0.018  # m
 FARTHEST = 2.0  # m
 
-Bools = NDArray[np.bool_]
 
-
-def photograph(light: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.uint8]:
+def photograph(light: Singles, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Return an sRGB picture (H, W, 3) of linear light, exposed for its brighter parts."""
     gray = light.mean(axis=2)
     exposure = rng.uniform(0.55, 1.0) / np.quantile(gray, rng.uniform(0.90, 0.985))

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mushpipe import Camera
+from mushpipe.core.arrays import Floats, Ints, Singles
 from training.traced.bed import Bed
-from training.traced.mesh import Floats, Mesh, joined
+from training.traced.mesh import Mesh, joined
 
 BOUNCES = 6
 
@@ -26,10 +26,10 @@ class View:
         owner: (H, W) row of the mushroom whose skin is seen, -1 for none.
     """
 
-    light: NDArray[np.float32]
+    light: Singles
     depth: Floats
     slant: Floats
-    owner: NDArray[np.int64]
+    owner: Ints
 
 
 def seen(bed: Bed, points: Floats) -> Floats:
@@ -60,9 +60,7 @@ def traced(bed: Bed, camera: Camera, samples: int, seed: int) -> View:
     return View(light[..., :3], *_exact(mi, scene, skins, camera))
 
 
-def _exact(
-    mi: Any, scene: Any, skins: list[Any], camera: Camera
-) -> tuple[Floats, Floats, NDArray[np.int64]]:
+def _exact(mi: Any, scene: Any, skins: list[Any], camera: Camera) -> tuple[Floats, Floats, Ints]:
     """Return depth, slant and owner of `View`, on the ray through the middle of each pixel."""
     import drjit as dr
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from training.traced.mesh import Floats, Mesh, grid_triangles, joined, mixed, waves
+from mushpipe.core.arrays import Floats
+from training.traced.mesh import Mesh, grid_triangles, joined, mixed, waves
 
 SEGMENTS = 96
 _STEP = 0.0009  # m between the points of the soil

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mushpipe import Camera
+from mushpipe.core.arrays import Floats
 from mushpipe.core.truth import Ignore, Truth
 from mushpipe.sim.annotate import (
     MIN_INSIDE,
@@ -16,7 +17,7 @@ from mushpipe.sim.annotate import (
 )
 from mushpipe.sim.mushroom import turned_to
 from training.traced.bed import Bed, Mushroom
-from training.traced.mesh import Floats, Mesh
+from training.traced.mesh import Mesh
 from training.traced.render import View, seen
 
 LARGEST_PX = 60.0
