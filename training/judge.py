@@ -81,15 +81,16 @@ def table(scores: dict[tuple[str, str], Score], names: list[str]) -> str:
     """Return the figures as text."""
     conditions = list(dict.fromkeys(c for c, _ in scores))
     lines = ["F (recall/precision) in per cent; errors in px of caps visible to at least a half"]
-    lines.append(f"{'':10}" + "".join(f"{name:>20}" for name in names))
+    lines.append(f"{'':13}" + "".join(f"{name:>20}" for name in names))
     for condition in conditions:
         row = [scores[condition, name] for name in names]
         cells = (f"{s.f:.3f} ({s.recall:.2f}/{s.precision:.2f})" for s in row)
-        lines.append(f"{condition:10}" + "".join(f"{cell:>20}" for cell in cells))
+        lines.append(f"{condition:13}" + "".join(f"{cell:>20}" for cell in cells))
     for title, part in (("all", conditions), ("beds", BEDS)):
-        for name in names:
+        present = [condition for condition in part if condition in conditions]
+        for name in names if present else ():
             whole = Score()
-            for condition in part:
+            for condition in present:
                 whole.merge(scores[condition, name])
             lines.append(f"{name:12} {title}: F {whole.f:.4f}, " + errors(whole))
     return "\n".join(lines)
