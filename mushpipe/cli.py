@@ -16,6 +16,7 @@ from mushpipe.doctor import register as register_doctor
 from mushpipe.evaluate.cli import register as register_eval
 from mushpipe.output import Output, OutputOption
 from mushpipe.proof.cli import register as register_proof
+from mushpipe.reading import file_argument
 from mushpipe.record import register as register_record
 from mushpipe.robot.commands import app as robot_app
 from mushpipe.viewing import register as register_viewing
@@ -36,7 +37,7 @@ plugins_app = typer.Typer(help="What is installed.", no_args_is_help=True)
 app.add_typer(plugins_app, name="plugins")
 app.add_typer(robot_app, name="robot")
 
-GraphArgument = Annotated[Path, typer.Argument(help="graph file, or a failure capsule")]
+GraphArgument = Annotated[Path, file_argument("graph file, or a failure capsule")]
 SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="A.B=VALUE", help="change a setting: segment.use=otsu"),
@@ -178,7 +179,7 @@ def graph(
 
 @app.command()
 def info(
-    file: Annotated[Path, typer.Argument(help="recording or results")],
+    file: Annotated[Path, file_argument("recording or results")],
     output: OutputOption = Output.text,
 ) -> None:
     """Tell what a recording holds, and whether it is whole."""
@@ -191,7 +192,7 @@ def info(
 
 @app.command()
 def export(
-    results: Annotated[Path, typer.Argument(help="recording written by a sink mcap")],
+    results: Annotated[Path, file_argument("recording written by a sink mcap")],
     output: Annotated[Export, typer.Option("--format")] = Export.ndjson,
     topic: Annotated[str | None, typer.Option(help="which picks, where there are several")] = None,
 ) -> None:

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mushpipe.reading import file_argument
+
 if TYPE_CHECKING:
     from mushpipe.sinks.rerun import RerunSink
 
@@ -30,7 +32,7 @@ def register(app: typer.Typer) -> None:
 
 
 def figure(
-    results: Annotated[Path, typer.Argument(help="recording written by a sink mcap")],
+    results: Annotated[Path, file_argument("recording written by a sink mcap")],
     out: Annotated[Path, typer.Option("--out", "-o", help="image to write: .png .jpg .pdf .svg")],
     kind: Annotated[FigureKind, typer.Option(help="which figure")] = FigureKind.stages,
     frame: Annotated[int, typer.Option(help="number of the frame")] = 0,
@@ -63,7 +65,7 @@ def figure(
 
 
 def view(
-    file: Annotated[Path, typer.Argument(help="recording, or results written by a sink mcap")],
+    file: Annotated[Path, file_argument("recording, or results written by a sink mcap")],
     save: Annotated[Path | None, typer.Option(help="write an .rrd file, open no window")] = None,
     serve: Annotated[
         int | None,

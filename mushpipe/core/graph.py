@@ -16,7 +16,7 @@ from mushpipe.core.errors import GraphError, PluginError, Problem, suggest
 from mushpipe.core.faults import faults_of
 from mushpipe.core.overrides import apply_override, encoding_fault
 from mushpipe.core.overwriting import same_file
-from mushpipe.core.paths import from_home
+from mushpipe.core.paths import from_home, real
 from mushpipe.core.plan import Node, Plan
 from mushpipe.core.plugins import Registry, in_file
 from mushpipe.core.ports import OF_SOURCE, ports_of
@@ -251,7 +251,7 @@ def _node(
         message = f"the settings of '{use}' cannot be written into a graph and read again: {fault}"
         problems.append(document.problem((*at, "use"), message))
     if in_file(use):
-        use = str((base / from_home(use)).resolve())
+        use = str(real(base / from_home(use)))
     attributes = settings_of(plugin_class)
     paths = {
         key: str(value)

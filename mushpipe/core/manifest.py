@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mushpipe.core.edges import files_of
+from mushpipe.core.errors import InputError
 from mushpipe.core.plan import Plan
 from mushpipe.core.stage import RunInfo
 
@@ -37,9 +38,16 @@ def _describe(path: Path) -> dict[str, Any]:
 
 
 def sha256(path: Path) -> str:
-    """Return the SHA-256 of a file, in hexadecimal digits."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    """Return the SHA-256 of a file, in hexadecimal digits.
+
+    Raises:
+        InputError: It cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
 
 
 def _versions(plan: Plan) -> dict[str, str]:

@@ -9,13 +9,14 @@ from io import FileIO
 from pathlib import Path
 
 from mushpipe.core.errors import UsageError
+from mushpipe.core.paths import real
 
 
 def same_file(a: Path, b: Path) -> bool:
     """Whether two paths lead to one file, by whatever links; a device such as /dev/null is none."""
     if a.exists() and not a.is_file():
         return False
-    return a.resolve() == b.resolve() or (a.exists() and b.exists() and a.samefile(b))
+    return real(a) == real(b) or (a.exists() and b.exists() and a.samefile(b))
 
 
 def spare(out: Path | None, *read: Path) -> None:

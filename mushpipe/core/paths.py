@@ -28,6 +28,11 @@ def from_home(path: str | Path) -> Path:
     return Path(path)
 
 
+def real(path: Path) -> Path:
+    """Return where a path leads; `Path.resolve` fails on a link that leads to itself."""
+    return Path(os.path.realpath(path))
+
+
 def resolve_path(path: Path, info: ValidationInfo) -> Path:
     """Return a path of a setting, relative to the graph file or to the shell; a validator."""
     if path == STDIO:
@@ -38,7 +43,7 @@ def resolve_path(path: Path, info: ValidationInfo) -> Path:
     whole = Path("" if from_shell else context.get("base", "")) / path
     short = Path(os.path.normpath(whole))
     # ".." behind a link is beside what it leads to
-    return short if short.resolve() == whole.resolve() else whole
+    return short if real(short) == real(whole) else whole
 
 
 GraphPath = Annotated[Path, AfterValidator(resolve_path)]

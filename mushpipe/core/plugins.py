@@ -24,7 +24,7 @@ from typing import Any, cast
 import pluggy
 
 from mushpipe.core.errors import DependencyError, PluginError, suggest
-from mushpipe.core.paths import from_home
+from mushpipe.core.paths import from_home, real
 from mushpipe.core.stage import Kind, Plugin, kind_of
 
 logger = logging.getLogger("mushpipe")
@@ -252,7 +252,7 @@ def class_in_file(use: str, base: Path) -> type[Plugin]:
         PluginError: There is no such file or class, or it cannot be imported.
     """
     path_text, _, name = use.rpartition(":") if ".py:" in use else (use, "", "")
-    path = (base / from_home(path_text)).resolve()
+    path = real(base / from_home(path_text))
     module = _module_of_file(path)
     if not name:
         known = ", ".join(_classes(module)) or "none"

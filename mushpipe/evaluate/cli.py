@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mushpipe.output import Output, OutputOption
+from mushpipe.reading import file_argument, file_option
 
 if TYPE_CHECKING:
     from mushpipe.core.plan import Plan
@@ -23,14 +24,14 @@ if TYPE_CHECKING:
 
 
 TargetsArgument = Annotated[
-    list[Path], typer.Argument(help="results to judge; or a graph to run, then recordings")
+    list[Path], file_argument("results to judge; or a graph to run, then recordings")
 ]
 TruthOption = Annotated[
     list[Path] | None,
-    typer.Option(help="labels (JSON) or a recording with truth; one for all, or one each"),
+    file_option("labels (JSON) or a recording with truth; one for all, or one each"),
 ]
 RecordingsOption = Annotated[
-    list[Path] | None, typer.Option(help="what the graph runs on; a folder is all in it")
+    list[Path] | None, file_option("what the graph runs on; a folder is all in it")
 ]
 SetOption = Annotated[
     list[str] | None,
@@ -70,7 +71,7 @@ def register(app: typer.Typer) -> None:
 
 @calibrate_app.command("depth")
 def calibrate_depth(
-    recordings: Annotated[list[Path], typer.Argument(help="planes square to the camera")],
+    recordings: Annotated[list[Path], file_argument("planes square to the camera")],
     plane: Annotated[
         str, typer.Option(metavar="METRES", help="true distances; one for all, or one each")
     ],

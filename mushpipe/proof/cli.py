@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mushpipe.reading import file_argument, file_option
+
 if TYPE_CHECKING:
     from mushpipe.core.plan import Plan
     from mushpipe.proof.compare import Comparison, Difference
@@ -24,8 +26,8 @@ _FIGURES = (
 
 
 def compare(
-    a: Annotated[Path, typer.Argument(help="recording written by a sink mcap")],
-    b: Annotated[Path, typer.Argument(help="another, to be the same")],
+    a: Annotated[Path, file_argument("recording written by a sink mcap")],
+    b: Annotated[Path, file_argument("another, to be the same")],
     tol: Annotated[
         float,
         typer.Option(min=0, help="what measured numbers, and which share of pixels, may differ"),
@@ -71,7 +73,7 @@ def _verdict(found: Comparison) -> str:
 
 
 def bench(
-    graph: Annotated[Path, typer.Argument(help="graph file")],
+    graph: Annotated[Path, file_argument("graph file")],
     recording: Annotated[
         str | None, typer.Argument(help="recording to play in place of the graph's source")
     ] = None,
@@ -84,7 +86,7 @@ def bench(
     ] = None,
     out: Annotated[Path | None, typer.Option("--json", help="file for the figures")] = None,
     baseline: Annotated[
-        Path | None, typer.Option(help="figures of an earlier run, to compare with")
+        Path | None, file_option("figures of an earlier run, to compare with")
     ] = None,
     allow: Annotated[
         float, typer.Option(help="exit with 3 where a median is more times the baseline's", min=1)

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mushpipe.reading import file_argument, file_option
+
 if TYPE_CHECKING:
     import ssl
 
@@ -95,8 +97,8 @@ def client(
         bool, typer.Option("--accept-replay", help="take targets of a recording")
     ] = False,
     name: Annotated[str, typer.Option(help="what to call ourselves")] = "",
-    token_file: Annotated[Path | None, typer.Option(help="file with the server's token")] = None,
-    tls_ca: Annotated[Path | None, typer.Option(help="speak TLS; trust this PEM")] = None,
+    token_file: Annotated[Path | None, file_option("file with the server's token")] = None,
+    tls_ca: Annotated[Path | None, file_option("speak TLS; trust this PEM")] = None,
     raw: Annotated[bool, typer.Option("--raw", help="print the lines as they come")] = False,
 ) -> None:
     """Print targets and acknowledge them, reconnecting when the server goes away."""
@@ -107,7 +109,7 @@ def client(
         raise typer.BadParameter("--max and --max-age-ms go with --mode request")
     hello: dict[str, Any] = {"accept_replay": accept_replay, "name": name}
     if token_file is not None:
-        hello["token"] = token_file.read_text().strip()
+        hello["token"] = _token(token_file)
     if tls_ca is not None:
         hello["tls"] = _trust(tls_ca)
     asked = {"max": 10 if most is None else most}
@@ -153,6 +155,14 @@ def _converse(connection: RobotClient, talk: _Talk) -> None:
             time.sleep(talk.every)
 
 
+def _token(path: Path) -> str:
+    try:
+        return path.read_text().strip()
+    except (OSError, UnicodeDecodeError) as error:
+        why = getattr(error, "strerror", None) or "it is no text"
+        raise typer.BadParameter(f"--token-file {path}: {why}") from error
+
+
 def _trust(path: Path) -> ssl.SSLContext:
     import ssl
 
@@ -188,7 +198,7 @@ def _show(message: dict[str, Any], raw: bool) -> None:
 
 @app.command()
 def replay(
-    file: Annotated[Path, typer.Argument(help="transcript written by a sink robot-json")],
+    file: Annotated[Path, file_argument("transcript written by a sink robot-json")],
     connect: Annotated[
         str | None, typer.Option(help="host:port of a server: play the client to it")
     ] = None,
@@ -201,7 +211,7 @@ def replay(
         bool, typer.Option("--accept-replay", help="with --connect: take a recording's targets")
     ] = False,
     token_file: Annotated[
-        Path | None, typer.Option(help="with --connect: file with the server's token")
+        Path | None, file_option("with --connect: file with the server's token")
     ] = None,
 ) -> None:
     """Play a recorded transcript against a server or a client, printing every line.
@@ -223,7 +233,7 @@ def replay(
     try:
         if connect is not None:
             hello: dict[str, Any] = {"accept_replay": True} if accept_replay else {}
-            hello |= {} if token_file is None else {"token": token_file.read_text().strip()}
+            hello |= {} if token_file is None else {"token": _token(token_file)}
             as_client(lines, *_split(connect), show, hello)
         else:
             as_server(lines, listen or 0, show, listening)

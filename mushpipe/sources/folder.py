@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from mushpipe import Header, InputError, ReplaySource, RgbdFrame, UsageError
-from mushpipe.core.paths import GraphPath
+from mushpipe.core.paths import GraphPath, real
 from mushpipe.core.types import COLOR_FRAME
 from mushpipe.sources.recorded import NO_CAMERA, NO_DEPTH, Intrinsics
 
@@ -70,7 +70,7 @@ class ImagesSource(ReplaySource):
 
     def name(self) -> str:
         """Return the folder's name."""
-        return self.path.resolve().name
+        return real(self.path).name
 
     def files(self) -> tuple[Path, ...]:
         """Return all images."""
@@ -189,7 +189,10 @@ def _is_image(path: Path) -> bool:
 
 
 def _read(path: Path, how: int) -> NDArray[Any]:
-    data = np.frombuffer(path.read_bytes(), np.uint8)
+    try:
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     image = cv2.imdecode(data, how) if len(data) else None
     if image is None:
         raise InputError(f"{path}: it is no image, or damaged")

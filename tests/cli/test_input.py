@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
+import pytest
+from typer.testing import CliRunner
 
-from mushpipe import Camera, Header, RgbdFrame
+from mushpipe import Camera, Header, InputError, RgbdFrame
+from mushpipe.cli import app
 from mushpipe.core import wire
 from mushpipe.core.errors import EXIT_DAMAGED, EXIT_OK
 from mushpipe.core.recorder import RecordingWriter
@@ -73,3 +77,55 @@ def test_an_empty_recording_is_incomplete(folder: Path) -> None:
     done = mushpipe("run", "graph.yaml", "--source", "a.mcap", cwd=folder)
     assert done.returncode == EXIT_DAMAGED
     assert "it holds no colour images (it holds no topics at all)" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["run", "graph.yaml", "--source"],
+        ["record", "-o", "copy.mcap", "--source"],
+        ["bench", "graph.yaml"],
+        ["info"],
+    ],
+)
+@pytest.mark.parametrize(
+    ("leads_to", "why"),
+    [("/proc/self/mem", "Input/output error"), ("a.mcap", "Too many levels of symbolic links")],
+)
+def test_a_recording_that_cannot_be_read_is_the_inputs_fault(
+    folder: Path, arguments: list[str], leads_to: str, why: str
+) -> None:
+    """It was told as a failure of the source, and a link to itself as a traceback."""
+    (folder / "a.mcap").symlink_to(leads_to)
+    done = mushpipe(*arguments, "a.mcap", cwd=folder)
+    last = done.stderr.splitlines()[-1].replace(f"{folder}/", "")
+    assert last == f"error: a.mcap: cannot be read: {why}"
+    assert done.returncode == EXIT_DAMAGED
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["run", "a.mcap"],
+        ["info", "a.mcap"],
+        ["export", "a.mcap"],
+        ["figure", "a.mcap", "-o", "a.png"],
+        ["view", "a.mcap", "--save", "a.rrd"],
+        ["compare", "a.mcap", "a.mcap"],
+        ["eval", "a.mcap"],
+        ["eval", "a.mcap", "--truth", "a.mcap"],
+        ["calibrate", "depth", "a.mcap", "--plane", "1"],
+        ["robot", "replay", "a.mcap", "--listen", "0"],
+    ],
+)
+def test_every_verb_itself_says_that_a_file_cannot_be_read(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str]
+) -> None:
+    """Typer looked first, and ended some verbs with 2 where others end with 4."""
+    (folder / "a.mcap").touch()
+    monkeypatch.chdir(folder)
+    with monkeypatch.context() as nothing_readable:
+        nothing_readable.setattr("os.access", lambda _, mode: mode != os.R_OK)
+        done = CliRunner().invoke(app, arguments)
+    assert isinstance(done.exception, InputError), done.output
+    assert "a.mcap: the file is empty" in str(done.exception)

@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from mushpipe.cli import app
-from mushpipe.core.errors import InputError
+from mushpipe.core.errors import EXIT_USAGE, InputError
 from mushpipe.robot import commands
 from mushpipe.robot.client import RobotClient
 from mushpipe.robot.replay import as_server, lines_of
@@ -210,3 +210,12 @@ def test_the_example_picks() -> None:
         command = [sys.executable, ROOT / "examples/robot/client.py", str(b.port)]
         done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
     assert [line.split()[0] for line in done.stdout.splitlines()] == ["m0", "m1", "m2"]
+
+
+def test_a_token_that_cannot_be_read_is_not_the_servers_fault(tmp_path: Path) -> None:
+    path = tmp_path / "robot.mcap"
+    record(path)
+    for verb in (["client", "127.0.0.1:1"], ["replay", path, "--connect", "127.0.0.1:1"]):
+        done = robot(*verb, "--token-file", "none")
+        assert done.exit_code == EXIT_USAGE
+        assert "--token-file none: No such file or directory" in done.output
