@@ -108,12 +108,13 @@ class RecordingReader:
         self.path = path
         self.damage: list[str] = []
         self._index: Index | None = None
-        if path.is_fifo():  # what was read of it is gone: the rest would pass for a damaged file
-            raise UsageError(
-                f"{path}: it is a pipe, and recordings are read more than once: save it as a file; "
-                "a graph plays what is piped into 'mushpipe run GRAPH --source -'"
-            )
         try:
+            # what was read of a pipe is gone: the rest would pass for a damaged file
+            if path.is_fifo():
+                raise UsageError(
+                    f"{path}: it is a pipe, and recordings are read more than once: save it as a "
+                    "file; a graph plays what is piped into 'mushpipe run GRAPH --source -'"
+                )
             with path.open("rb") as file:
                 magic = file.read(8)
         except FileNotFoundError:

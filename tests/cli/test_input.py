@@ -129,3 +129,12 @@ def test_every_verb_itself_says_that_a_file_cannot_be_read(
         done = CliRunner().invoke(app, arguments)
     assert isinstance(done.exception, InputError), done.output
     assert "a.mcap: the file is empty" in str(done.exception)
+
+
+def test_a_name_that_no_file_can_have_is_told_as_a_recording_that_cannot_be_read(
+    folder: Path,
+) -> None:
+    name = 300 * "a" + ".mcap"
+    done = mushpipe("info", name, cwd=folder)
+    assert done.stderr == f"error: {name}: cannot be read: File name too long\n"
+    assert done.returncode == EXIT_DAMAGED
