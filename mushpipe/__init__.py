@@ -3,6 +3,7 @@
 This module is what a plugin author needs.
 """
 
+import mushpipe.core.interrupt  # noqa: F401 - before what takes long to import
 from mushpipe.core.errors import InputError, MushpipeError, UsageError
 from mushpipe.core.geometry import Camera, quaternion_from_axis
 from mushpipe.core.paths import GraphPath, SinkPath

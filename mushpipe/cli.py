@@ -251,11 +251,15 @@ register_proof(app)
 
 def main() -> None:
     """Entry point: errors meant for the user become one message and an exit code."""
-    from mushpipe.core.errors import MushpipeError
+    from mushpipe.core.errors import EXIT_INTERRUPTED, MushpipeError
+    from mushpipe.core.interrupt import watch
 
     faulthandler.enable(file=2)  # where native code of a plugin crashes, which one it was
     try:
+        watch()
         app()
+    except KeyboardInterrupt:
+        sys.exit(EXIT_INTERRUPTED)
     except MushpipeError as error:
         sys.stderr.write(f"error: {error}\n")
         sys.exit(error.exit_code)

@@ -79,3 +79,55 @@ def test_who_reads_our_output_may_have_read_enough() -> None:
     done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, check=False)
     os.close(write)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("begun", ["numpy", "typer", "mushpipe.core.plan"])
+def test_ctrl_c_while_the_program_is_imported_is_one_line(tmp_path: Path, begun: str) -> None:
+    """It was a traceback into whatever was being imported."""
+    (tmp_path / "sitecustomize.py").write_text(
+        f"""\
+import os, signal, sys
+
+class Interrupt:
+    def find_spec(self, name, *_):
+        if name == {begun!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupt())
+"""
+    )
+    path = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
+    done = subprocess.run(
+        [sys.executable, "-m", "mushpipe", "bench", "graph.yaml"],
+        cwd=tmp_path, env={**os.environ, "PYTHONPATH": path},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (EXIT_INTERRUPTED, "SIGINT: interrupted\n")
+
+
+def test_other_programs_keep_their_ctrl_c() -> None:
+    code = "import signal, mushpipe.cli; print(signal.getsignal(signal.SIGINT).__name__)"
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout == "default_int_handler\n"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_bench_that_is_interrupted_says_so_and_leaves_nothing(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    (tmp_path / "graph.yaml").write_text(GRAPH)
+    (tmp_path / "say.py").write_text(SAY)
+    (tmp_path / "tmp").mkdir()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mushpipe", "bench", "graph.yaml", "--frames", "100000"],
+        cwd=tmp_path, env={**os.environ, "TMPDIR": str(tmp_path / "tmp")},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stdout is not None
+    assert process.stdout.readline() == "frame\n"
+    process.send_signal(number)
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == EXIT_INTERRUPTED, stderr
+    assert stderr.endswith(f"{number.name}: interrupted\n")
+    assert not list((tmp_path / "tmp").glob("mushpipe-*"))
