@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mushpipe.finite import finite
 from mushpipe.output import Output, OutputOption
 from mushpipe.reading import file_argument, file_option
 
@@ -49,7 +50,9 @@ PlaneOption = Annotated[
     str | None,
     typer.Option(metavar="METRES", help="judge the depth of a plane so far away; one, or one each"),
 ]
-IouOption = Annotated[float, typer.Option(min=0.01, max=1, help="circle IoU of a match")]
+IouOption = Annotated[
+    float, typer.Option(min=0.01, max=1, callback=finite, help="circle IoU of a match")
+]
 GravityOption = Annotated[
     str, typer.Option(metavar="X,Y,Z", help="direction of gravity in the camera's frame")
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import operator
 import re
 from collections.abc import Iterable, Mapping
@@ -45,11 +46,12 @@ def parse_threshold(text: str) -> Threshold:
     """
     form = _FORM.fullmatch(text.strip())
     try:
-        if form is None or form[1] != form[3]:
+        if form is None or form[1] != form[3] or not math.isfinite(bound := float(form[5])):
             raise ValueError
-        return Threshold(text, form[2], bool(form[1]), form[4], float(form[5]))
+        return Threshold(text, form[2], bool(form[1]), form[4], bound)
     except ValueError:
-        raise UsageError(f"--threshold {text}: expected NAME>=NUMBER or |NAME|<=NUMBER") from None
+        expected = "NAME>=NUMBER or |NAME|<=NUMBER, with a finite number"
+        raise UsageError(f"--threshold {text}: expected {expected}") from None
 
 
 def require_known(thresholds: Iterable[Threshold], known: Iterable[str]) -> None:

@@ -157,13 +157,13 @@ def _allocated_mb(plan: Plan) -> float:
 
 
 def slower(result: Mapping[str, Any], baseline: Mapping[str, Any]) -> dict[str, float]:
-    """Return by node how many times the baseline's median its own is."""
+    """Return by node how many times the baseline's median its own is, where both are known."""
     before = {**baseline["nodes"], "all stages": baseline["frame"]}
     now = {**result["nodes"], "all stages": result["frame"]}
     return {
         name: now[name]["p50_ms"] / before[name]["p50_ms"]
         for name in now.keys() & before.keys()
-        if before[name]["p50_ms"]
+        if before[name]["p50_ms"] > 0 and now[name]["p50_ms"] >= 0  # NaN of what had no frame
     }
 
 
@@ -180,7 +180,7 @@ def read_baseline(path: Path, now: Mapping[str, Any]) -> dict[str, Any]:
     """
     try:
         content: dict[str, Any] = json.loads(path.read_text())
-        content["nodes"], content["frame"]["p50_ms"]
+        slower(content, content)
         before, wanted = _identity(content), _identity(now)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UsageError(f"{path}: no figures of 'mushpipe bench --json': {error}") from error

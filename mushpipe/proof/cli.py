@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mushpipe.finite import finite
 from mushpipe.reading import file_argument, file_option
 
 if TYPE_CHECKING:
@@ -30,7 +31,11 @@ def compare(
     b: Annotated[Path, file_argument("another, to be the same")],
     tol: Annotated[
         float,
-        typer.Option(min=0, help="what measured numbers, and which share of pixels, may differ"),
+        typer.Option(
+            min=0,
+            callback=finite,
+            help="what measured numbers, and which share of pixels, may differ",
+        ),
     ] = 0.0,
     topics: Annotated[str, typer.Option(help="compare only these, as '/mushpipe/*'")] = "*",
     long: Annotated[bool, typer.Option("--long", help="tell of every frame")] = False,
@@ -79,7 +84,10 @@ def bench(
     ] = None,
     frames: Annotated[int, typer.Option(help="frames to measure", min=10)] = 300,
     speed: Annotated[
-        float, typer.Option(min=0, help="pace of the replay: 1 is real time, 0 as fast as it goes")
+        float,
+        typer.Option(
+            min=0, callback=finite, help="pace of the replay: 1 is real time, 0 as fast as it goes"
+        ),
     ] = 0.0,
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="A.B=VALUE", help="change a setting")
@@ -89,7 +97,10 @@ def bench(
         Path | None, file_option("figures of an earlier run, to compare with")
     ] = None,
     allow: Annotated[
-        float, typer.Option(help="exit with 3 where a median is more times the baseline's", min=1)
+        float,
+        typer.Option(
+            min=1, callback=finite, help="exit with 3 where a median is more times the baseline's"
+        ),
     ] = 1.5,
 ) -> None:
     """Measure a graph: time of every node, latency, frames/s, CPU, memory.

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mushpipe.finite import finite
 from mushpipe.reading import file_argument, file_option
 
 if TYPE_CHECKING:
@@ -89,7 +90,9 @@ def client(
         int | None, typer.Option("--max", help="targets to ask for, default 10", min=1, max=1000)
     ] = None,
     max_age_ms: Annotated[int | None, typer.Option(help="refuse what is older", min=1)] = None,
-    every: Annotated[float, typer.Option(help="seconds between requests", min=0, max=9)] = 1.0,
+    every: Annotated[
+        float, typer.Option(help="seconds between requests", min=0, max=9, callback=finite)
+    ] = 1.0,
     ack: Annotated[
         list[Outcome] | None, typer.Option(help="say this of the best target; may be repeated")
     ] = None,

@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
+from typer.testing import CliRunner
 
+from mushpipe.cli import app
 from mushpipe.core.errors import EXIT_DAMAGED, EXIT_FAILED, EXIT_USAGE
 from mushpipe.core.recording import RecordingReader
 from tests.cli.shell import GRAPH, ROOT, mushpipe
@@ -334,3 +336,31 @@ def test_the_module_is_the_command() -> None:
     )
     assert done.returncode == 0
     assert "phase-hough" in done.stdout
+
+
+@pytest.mark.parametrize("number", ["nan", "inf"])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["compare", "a.mcap", "a.mcap", "--tol"],
+        ["bench", "graph.yaml", "--allow"],
+        ["bench", "graph.yaml", "--speed"],
+        ["eval", "a.mcap", "--iou"],
+        ["robot", "client", "--every"],
+        ["run", "graph.yaml", "--speed"],
+        ["record", "--source", "synthetic", "-o", "b.mcap", "--duration"],
+        ["eval", "graph.yaml", "--threshold", "f>=0.1", "--threshold", "|radius_bias_px|<="],
+        ["eval", "a.mcap", "--plane"],
+    ],
+)
+def test_no_option_that_decides_something_takes_what_is_no_number(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], number: str
+) -> None:
+    """Of NaN every comparison is false: no difference was above such a tolerance."""
+    monkeypatch.chdir(folder)
+    last = arguments[-1]
+    given = [*arguments[:-1], last + number] if last.endswith("=") else [*arguments, number]
+    done = CliRunner().invoke(app, given)
+    assert getattr(done.exception, "exit_code", done.exit_code) == EXIT_USAGE
+    option = next(text for text in reversed(given) if text.startswith("--"))
+    assert option in f"{done.output} {done.exception}"

@@ -30,7 +30,9 @@ def test_thresholds(text: str, value: float, kept: bool) -> None:
     assert outcome.kept is kept
 
 
-@pytest.mark.parametrize("text", ["f", "f=1", "f>=", "f>=x", "|f>=1", "f|>=1", ">=1"])
+@pytest.mark.parametrize(
+    "text", ["f", "f=1", "f>=", "f>=x", "|f>=1", "f|>=1", ">=1", "f>=nan", "f<=inf"]
+)
 def test_other_forms_are_refused(text: str) -> None:
     with pytest.raises(UsageError, match="expected NAME>=NUMBER"):
         parse_threshold(text)

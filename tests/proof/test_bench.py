@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import threading
 import tracemalloc
 from contextlib import suppress
@@ -99,7 +100,19 @@ def test_a_node_is_compared_with_itself_in_the_baseline() -> None:
     assert found == pytest.approx({"a": 1.5, "b": 0.5, "all stages": 6 / 13})
 
 
-@pytest.mark.parametrize("content", ["", "[]", '{"nodes": {}}', '{"nodes": {}, "frame": {}}'])
+def test_what_had_no_frame_hides_nothing_that_became_slower() -> None:
+    """Of a graph without stages the time of all stages is NaN, which is below any limit."""
+    now, before = figures(a=3.0, b=math.nan), figures(a=2.0, b=math.nan)
+    assert slower(now, before) == {"a": 1.5}
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        *("", "[]", '{"nodes": {}}', '{"nodes": {}, "frame": {}}'),
+        '{"nodes": {"a": {"p50_ms": "1"}}, "frame": {"p50_ms": 1}}',
+    ],
+)
 def test_a_file_without_figures_is_no_baseline(tmp_path: Path, content: str) -> None:
     path = tmp_path / "b.json"
     path.write_text(content)
