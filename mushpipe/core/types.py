@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -107,6 +108,7 @@ class RgbdFrame:
                 f"the image is {color.shape[1]}x{color.shape[0]}, "
                 f"its calibration is for {size[1]}x{size[0]}"
             )
+        object.__setattr__(self, "attached", MappingProxyType(dict(self.attached)))
 
     def _check_depth(self, depth: NDArray[Any]) -> None:
         if depth.dtype not in (np.uint16, np.float32):
@@ -190,3 +192,7 @@ class Trace:
     outputs: Mapping[str, tuple[Any, ...]]
     durations_ns: Mapping[str, int]
     left_ns: int | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("outputs", "durations_ns"):  # other sinks see the same
+            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))

@@ -86,7 +86,8 @@ def test_localization_shows_nan_before_and_the_estimate_after() -> None:
 def test_locations_are_drawn_with_the_circles_they_are_of() -> None:
     trace = scene()
     more = Circles(np.full((3, 2), 9.0), np.ones(3), np.ones(3))
-    trace.outputs["second"] = (more,)  # a detector below the localizer
+    # a detector below the localizer
+    trace = replace(trace, outputs={**trace.outputs, "second": (more,)})
     diameters = draw_diameter(trace).axes[0]
     assert texts(diameters, RED) == ["41", "NaN"]
     with pytest.raises(UsageError, match="has 2 locations, and 3 circles above them"):

@@ -1,11 +1,12 @@
 """Frames and masks: what they check, what they compute."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from mushpipe import Camera, Header, Mask, RgbdFrame
+from mushpipe import Camera, Header, Mask, RgbdFrame, Trace
 from tests.core.lab import make_frame
 
 COLOR = np.zeros((4, 6, 3), np.uint8)
@@ -35,6 +36,16 @@ def test_a_header_of_other_types_is_refused(changes: dict, message: str):
     with pytest.raises(TypeError) as caught:
         Header(**{"stamp_ns": 1, "sequence": 0, "frame_id": "c", **changes})
     assert str(caught.value) == message
+
+
+def test_no_sink_can_change_what_the_others_see():
+    frame = RgbdFrame(HEADER, COLOR, attached={"/truth": 1})
+    trace = Trace(frame, {"a": (frame,)}, {"a": 5})
+    for mapping in (trace.outputs, trace.durations_ns, trace.frame.attached):
+        with pytest.raises(TypeError, match="does not support item assignment"):
+            mapping["a"] = ()
+    assert replace(trace, left_ns=7).outputs == {"a": (frame,)}
+    assert replace(frame, depth_scale=0.5).attached == {"/truth": 1}
 
 
 def test_a_frame_is_locked():
