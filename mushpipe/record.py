@@ -102,10 +102,11 @@ def _compile(settings: dict[str, Any], overrides: list[Any], source: str) -> Pla
 
 def _files(plan: Plan) -> list[Path]:
     """Return the files of the recording that exist."""
+    from mushpipe.core.edges import recording_of
     from mushpipe.core.stage import RunInfo, Sink
 
     sink = plan.sinks[0].plugin
-    files = sink.files(RunInfo(plan.recording(), {})) if isinstance(sink, Sink) else ()
+    files = sink.files(RunInfo(recording_of(plan.source), {})) if isinstance(sink, Sink) else ()
     return [path for path in files if path.is_file()]
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mushpipe.core.document import Document
+from mushpipe.core.edges import recording_of
 from mushpipe.core.errors import UsageError
 from mushpipe.core.plan import Node, Plan
 from mushpipe.core.recorder import RecordingWriter
@@ -24,7 +25,7 @@ def write_capsule(folder: Path, plan: Plan, node: Node, frame: RgbdFrame, messag
     """
     folder.mkdir(parents=True, exist_ok=True)
     number = frame.header.sequence if plan.replay() else frame.header.stamp_ns
-    path = folder / f"failure-{plan.recording()}-{node.name}-{number}.mcap"
+    path = folder / f"failure-{recording_of(plan.source)}-{node.name}-{number}.mcap"
     kept = replace(
         plan,
         stages=tuple(map(_anchored, plan.stages)),

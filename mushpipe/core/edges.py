@@ -91,6 +91,24 @@ def files_of(node: Node, run: RunInfo | None = None) -> tuple[Path, ...]:
     return tuple(found)
 
 
+def recording_of(node: Node) -> str:
+    """Return the name of what a source plays, for file names.
+
+    Raises:
+        StageError: The source's ``name`` failed.
+        PluginError: It gave no text.
+    """
+    found: object = ""
+    with named(node):
+        if isinstance(node.plugin, Source):
+            found = node.plugin.name()
+    if not isinstance(found, str):
+        raise PluginError(
+            f"{node.kind} '{node.name}' ({node.use}): its name() gave {found!r}, expected text"
+        )
+    return found
+
+
 def limited(frames: Iterator[RgbdFrame], source: Source) -> Iterator[RgbdFrame]:
     """Yield frames up to the source's ``max_frames`` and ``max_seconds``."""
     end_ns: float = math.inf

@@ -8,7 +8,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from mushpipe.core.edges import files_of
+from mushpipe.core.edges import files_of, recording_of
 from mushpipe.core.errors import InputError
 from mushpipe.core.plan import Plan
 from mushpipe.core.stage import RunInfo
@@ -63,7 +63,7 @@ def _versions(plan: Plan) -> dict[str, str]:
 
 def manifest_path(plan: Plan) -> Path:
     """Return where a run's manifest goes: beside its first result file, else ``run.json``."""
-    info = RunInfo(plan.recording(), {})
+    info = RunInfo(recording_of(plan.source), {})
     for node in plan.sinks:
         for path in files_of(node, info):
             return path.with_suffix(".run.json")

@@ -65,11 +65,6 @@ class Plan:
         """All nodes, in the order in which frames pass them."""
         return (self.source, *self.stages, *self.sinks)
 
-    def recording(self) -> str:
-        """Return the name of what is played, for file names."""
-        source = self.source.plugin
-        return source.name() if isinstance(source, Source) else ""
-
     def into(self, folder: Path) -> Plan:
         """Return a plan whose sinks write into a folder of their own within one."""
 

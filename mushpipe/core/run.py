@@ -23,6 +23,7 @@ from mushpipe.core.edges import (
     opened,
     opener,
     plain,
+    recording_of,
 )
 from mushpipe.core.errors import InputError, MushpipeError, StageError
 from mushpipe.core.manifest import build_manifest
@@ -128,7 +129,8 @@ class _Runner:
         with named(self.plan.source):
             device = self.report.device = plain(source.describe())
             manifest = {**self.report.manifest, **({"device": device} if device else {})}
-            return RunInfo(source.name(), manifest, source.live, lambda: self.reader.box.accepted)
+            name, read = recording_of(self.plan.source), lambda: self.reader.box.accepted
+            return RunInfo(name, manifest, source.live, read)
 
     def _finish(self) -> None:
         """Tell the sinks how the run went; the first error of the run stays the one reported."""

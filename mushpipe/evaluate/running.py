@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mushpipe.core.document import read_document
+from mushpipe.core.edges import recording_of
 from mushpipe.core.errors import UsageError
 from mushpipe.core.graph import compile_document
 from mushpipe.core.plan import Plan
@@ -123,7 +124,7 @@ def result_path(plan: Plan) -> Path:
     sink = plan.sinks[0].plugin
     if not isinstance(sink, Sink):
         raise TypeError("the plan has no sink")
-    return sink.files(RunInfo(plan.recording(), {}))[0]
+    return sink.files(RunInfo(recording_of(plan.source), {}))[0]
 
 
 def slug(alternative: Alternative) -> str:

@@ -4,6 +4,7 @@ import hashlib
 import json
 import math
 import platform
+import re
 from importlib.metadata import version
 from pathlib import Path
 
@@ -214,6 +215,32 @@ def test_a_sink_that_names_no_tuple_of_files_is_told_of(lab: Lab, graph: str):
     assert str(caught.value) == (
         "sink 'out' (one): its files() gave PosixPath('bed.out'), expected a tuple of paths"
     )
+
+
+def test_a_source_that_does_not_name_what_it_plays_is_told_of(lab: Lab, graph: str):
+    """A sink that made a file name of it was blamed."""
+
+    class Numbered(Frames):
+        def name(self):
+            return 7
+
+    class Unmounted(Frames):
+        def name(self):
+            raise OSError("not mounted")
+
+    lab.registry.source("numbered", Numbered)
+    lab.registry.source("unmounted", Unmounted)
+    lab.registry.sink("one", OnePath)
+    text = "source 'source' (numbered): its name() gave 7, expected text"
+    plan = lab.compile(graph.replace("recorded", "numbered").replace("collect", "one"))
+    with pytest.raises(PluginError, match=re.escape(text)):
+        manifest_path(plan)
+    assert str(execute(plan, None, None).error) == text
+    plan = lab.compile(graph.replace("recorded", "unmounted"))
+    text = "source 'source' (unmounted) failed: OSError: not mounted"
+    with pytest.raises(StageError, match=re.escape(text)):
+        manifest_path(plan)
+    assert str(execute(plan, None, None).error) == text
 
 
 def test_a_source_that_cannot_name_its_files_is_told_of(lab: Lab, graph: str, caplog):
