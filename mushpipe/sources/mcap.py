@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -110,7 +110,8 @@ class McapSource(RecordedSource, ReplaySource):
             player.camera, player.frames = camera, 0
             # mushpipe writes frames in order, whatever their stamps; ROS sorts by what it logged
             messages = reader.messages(player.wanted(), start_ns, end_ns, player.numbered)
-            for frame in player.play(messages, hold=bool(player.beside)):
+            played = player.play(messages, hold=bool(player.beside))
+            for frame in played if turn else _watched(played, self.path):
                 header = frame.header
                 first, last = first or header, header
                 if turn:
@@ -143,6 +144,23 @@ def _beside(index: Index) -> set[str]:
     """Return what else was recorded of the frames themselves: truth, clocks; but no results."""
     images = {wire.COLOR_TOPIC, wire.DEPTH_TOPIC, wire.CAMERA_TOPIC}
     return {t for t in index.channels.keys() - images if not t.startswith(wire.RESULT_PREFIX)}
+
+
+def _watched(frames: Iterable[RgbdFrame], path: Path) -> Iterator[RgbdFrame]:
+    """Yield frames, and say where time first goes back: whether a clock was set, no file tells."""
+    last_ns, in_time = 0, True
+    for frame in frames:
+        header = frame.header
+        if in_time and header.stamp_ns < last_ns:
+            in_time = False
+            logger.warning(
+                "%s: stamps go back by %.3f s at frame %d; frames are played in the order of the "
+                "file, which is right where a clock was set: where parts of the file changed "
+                "places, sort it by time first",
+                *(path, (last_ns - header.stamp_ns) / 1e9, header.sequence),
+            )
+        last_ns = header.stamp_ns
+        yield frame
 
 
 def _first_camera(player: Player, reader: RecordingReader, start_ns: int) -> Camera | None:

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import Writer
 
 from mushpipe.core.types import RgbdFrame
 from mushpipe.sources.mcap import McapSource
@@ -153,6 +155,38 @@ def test_a_clock_that_was_set_back_costs_nothing(tmp_path: Path) -> None:
     frames, counts = run(tmp_path, entries)
     assert partners(frames) == [(i, i) for i in range(6)]
     assert counts == {}
+
+
+def in_chunks_of_one(path: Path) -> Path:
+    """Write a bag anew with a chunk per message, as programs with small chunks do."""
+    again = path.with_name("again.mcap")
+    with path.open("rb") as file, again.open("wb") as out:
+        writer, channels = Writer(out, chunk_size=1), dict[int, int]()
+        writer.start()
+        for schema, channel, message in make_reader(file).iter_messages(log_time_order=False):
+            if channel.id not in channels:
+                kind = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, "cdr", kind)
+            times = message.log_time, message.publish_time
+            writer.add_message(channels[channel.id], times[0], message.data, times[1])
+        writer.finish()
+    return again
+
+
+def test_where_halves_of_a_file_changed_places_it_is_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Nothing is lost, but tracks and pace go by an order that is not that of time."""
+    turned = [3, 4, 5, 0, 2, 1]
+    entries = [each for i in turned for each in (color_at(i), depth_at(i))]
+    path = in_chunks_of_one(write_bag(tmp_path, entries))
+    source = McapSource(path=path, loop=2)
+    frames = list(source.frames())
+    assert partners(frames) == [(i, i) for i in turned] * 2
+    assert source.counts() == {}
+    said = [r.getMessage() for r in caplog.records if "stamps go back" in r.getMessage()]
+    assert len(said) == 1
+    assert f"stamps go back by {5 * PERIOD / 1e9:.3f} s at frame 3; frames are played in" in said[0]
 
 
 def test_depth_without_colour_for_long_is_not_kept() -> None:
