@@ -17,6 +17,7 @@ from mushpipe.core.arrays import Floats, Ints, Rows
 from mushpipe.core.errors import UsageError
 from mushpipe.core.transform import Transform, TransformSetting
 from mushpipe.stages.plausible import require_plausible
+from mushpipe.stages.rows import require_same_rows
 from mushpipe.stages.surroundings import clearance, hidden_share
 from mushpipe.stages.tracks import Tracks
 
@@ -119,6 +120,7 @@ class MakePicks(Stage):
         """
         n = len(circles)
         poses = Poses.unknown(n) if poses is None else poses
+        require_same_rows(circles, locations, poses, frame.camera)
         require_plausible(circles, locations, poses, frame.camera)
         self._warn_of_inward(locations, poses, frame.header.sequence)
         self._total += n

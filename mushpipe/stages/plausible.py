@@ -1,4 +1,4 @@
-"""Whether locations and poses can be those of their circles: no other may reach a robot."""
+"""Whether a camera can have seen what locations and poses say: nothing else may reach a robot."""
 
 from __future__ import annotations
 
@@ -8,14 +8,7 @@ from mushpipe import Circles, Locations, Poses
 from mushpipe.core.arrays import Bools, Floats
 from mushpipe.core.geometry import Camera, lengths
 
-_ONE_CHAIN = (
-    "circles, locations and poses must come from one chain; what sorts or filters circles belongs "
-    "before the localizer"
-)
 _METRES = "are all lengths in metres, and all of this circle?"
-# Radii from the middle of its circle: a location is seen there, the apex of a leaning cap up to two
-# away. Neighbours are apart by two where they touch.
-ASTRAY = {"location": 1.0, "pose": 3.0}
 # No unit is mistaken for another by less. What is found differs by a factor of three at most.
 UNIT = 10.0
 
@@ -23,14 +16,9 @@ UNIT = 10.0
 def require_plausible(
     circles: Circles, locations: Locations, poses: Poses, camera: Camera | None
 ) -> None:
-    """Raise ValueError where rows were mixed up, or lengths are none of what a camera sees."""
-    if not len(circles) == len(locations) == len(poses):
-        counts = f"{len(circles)} circles, {len(locations)} locations, {len(poses)} poses"
-        raise ValueError(f"{counts}: {_ONE_CHAIN}")
-    for what, points in (("location", locations.position), ("pose", poses.apex)):
-        _require_in_front(points, what)
-        if camera is not None:
-            _require_same(circles, camera.project(points), what)
+    """Raise ValueError where something lies behind the camera, or a length is of another unit."""
+    _require_in_front(locations.position, "location")
+    _require_in_front(poses.apex, "pose")
     _require_distance(locations)
     if camera is not None:
         _require_size(circles, locations, poses, camera)
@@ -43,17 +31,6 @@ def _require_in_front(points: Floats, what: str) -> None:
         raise ValueError(
             f"row {row}: its {what} is at ({x:g}, {y:g}, {z:g}), which is not in front of the "
             "camera; where depth is missing, a location is NaN and its source MISSING"
-        )
-
-
-def _require_same(circles: Circles, seen: Floats, what: str) -> None:
-    """Raise ValueError where a point, seen at (N, 2) px, is not seen in its circle."""
-    away = np.linalg.norm(seen - circles.center, axis=1) > ASTRAY[what] * circles.radius
-    if (row := _first(away)) is not None:
-        (u, v), (x, y) = circles.center[row], seen[row]
-        raise ValueError(
-            f"row {row}: the circle is at ({u:.0f}, {v:.0f}), its {what} at ({x:.0f}, {y:.0f}): "
-            f"{_ONE_CHAIN}"
         )
 
 

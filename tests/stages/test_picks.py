@@ -146,6 +146,46 @@ def test_poses_of_other_circles_are_refused() -> None:
         )
 
 
+def exchange(apart_px: float, *seen_px: float) -> tuple[Circles, Locations, Poses]:
+    """Return two caps of radius 8 px side by side; their apexes are seen right of the first."""
+    found = locations(DepthSource.MEASURED, DepthSource.MEASURED, at=(50, 50 + apart_px))
+    pixels = np.array([(50 + u, 50.0) for u in seen_px])
+    poses = Poses(
+        quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)),
+        axis=np.tile([0.0, 0.0, -1.0], (2, 1)),
+        apex=CAMERA.deproject(pixels, np.full(2, 0.48)),
+        sigma_rad=np.zeros(2),
+        fitness=np.ones(2),
+        valid=np.ones(2, bool),
+    )
+    return circles_at((50, 50), (50 + apart_px, 50)), found, poses
+
+
+@pytest.mark.parametrize("seen_px", [(16, 0), (11, 5), (20, -4)])
+def test_poses_of_two_neighbours_that_changed_places_are_refused(
+    seen_px: tuple[float, float],
+) -> None:
+    """They are within the three radii of a leaning cap; a robot got the one for the other."""
+    with pytest.raises(ValueError, match="rows 0 and 1: the pose of each is seen in the circle of"):
+        MakePicks().process(frame_of(np.zeros((120, 160))), *exchange(16, *seen_px))
+
+
+@pytest.mark.parametrize(
+    ("apart_px", "seen_px"),
+    [
+        (16, (0, 16)),
+        (16, (15, 15)),  # one leans over the other
+        (16, (15, 23)),  # both lean the same way
+        (16, (7, 9)),  # towards each other
+        (6, (4, 2)),  # two circles on one cap
+        (6, (6, 0)),
+    ],
+)
+def test_poses_of_caps_that_lean_are_taken(apart_px: float, seen_px: tuple[float, float]) -> None:
+    frame = frame_of(np.zeros((120, 160)))
+    assert len(MakePicks().process(frame, *exchange(apart_px, *seen_px))) == 2
+
+
 def test_rows_must_agree() -> None:
     with pytest.raises(ValueError, match="2 circles, 1 locations, 2 poses"):
         MakePicks().process(
