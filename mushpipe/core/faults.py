@@ -37,6 +37,9 @@ def faults_of(
             what = place + of if place else f"'{use}'"
             given = f", got {json.dumps(item['input'], default=str)}" if place else ""
             message = item["msg"].removeprefix("Value error, ")
+            if item["type"] == "json_invalid":  # half a character: "\ud800", or of a name
+                what = what if use else "the graph"
+                message = "a text in it is not UTF-8: give the file another name"
             if not place:  # of all settings together, which the command line may have changed
                 texts = (text for key, text in document.overrides.items() if key[:-1] == at)
                 labels = ", ".join(dict.fromkeys(texts))

@@ -252,7 +252,11 @@ def class_in_file(use: str, base: Path) -> type[Plugin]:
         PluginError: There is no such file or class, or it cannot be imported.
     """
     path_text, _, name = use.rpartition(":") if ".py:" in use else (use, "", "")
-    path = real(base / from_home(path_text))
+    try:
+        path = real(base / from_home(path_text))
+        str(path).encode()
+    except ValueError as error:  # of a NUL; and what is not UTF-8 cannot stand in a manifest
+        raise PluginError(f"{use!r} cannot be the name of a file: {error}") from error
     module = _module_of_file(path)
     if not name:
         known = ", ".join(_classes(module)) or "none"

@@ -78,7 +78,12 @@ def _split(address: str) -> tuple[str, int]:
     host, colon, port = address.rpartition(":")
     if not (colon and host and port.isdecimal() and 0 < int(port) < 65536):
         raise typer.BadParameter(f"'{address}' is not host:port, with a port from 1 to 65535")
-    return host.removeprefix("[").removesuffix("]"), int(port)
+    host = host.removeprefix("[").removesuffix("]")
+    try:
+        host.encode("idna")
+    except UnicodeError:  # two dots in a row, more than 63 letters between two
+        raise typer.BadParameter(f"'{host}' cannot be the name of a host") from None
+    return host, int(port)
 
 
 @app.command()

@@ -364,3 +364,24 @@ def test_no_option_that_decides_something_takes_what_is_no_number(
     assert getattr(done.exception, "exit_code", done.exit_code) == EXIT_USAGE
     option = next(text for text in reversed(given) if text.startswith("--"))
     assert option in f"{done.output} {done.exception}"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["record", "--source", "synthetic", "-o", "\udcff.mcap"], "a text in it is not UTF-8"),
+        (["view", "\udcff.mcap", "--save", "a.rrd"], "a text in it is not UTF-8"),
+        (["plugins", "describe", "\udcff.py:A"], "cannot be the name of a file"),
+        (["validate", "nul.yaml"], "cannot be the name of a file: embedded null byte"),
+        (["validate", "half.yaml"], "half.yaml:1:1: the graph: a text in it is not UTF-8"),
+    ],
+)
+def test_names_that_cannot_be_are_told_in_words(
+    folder: Path, arguments: list[str], message: str
+) -> None:
+    (folder / "nul.yaml").write_text(GRAPH.replace("otsu", r'"a\0.py:A"'))
+    (folder / "half.yaml").write_text(GRAPH.replace("out.mcap", r'"\ud800.mcap"'))
+    done = mushpipe(*arguments, cwd=folder)
+    assert message in done.stderr
+    assert done.returncode == EXIT_USAGE
+    assert "Traceback" not in done.stderr

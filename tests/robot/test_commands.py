@@ -219,3 +219,12 @@ def test_a_token_that_cannot_be_read_is_not_the_servers_fault(tmp_path: Path) ->
         done = robot(*verb, "--token-file", "none")
         assert done.exit_code == EXIT_USAGE
         assert "--token-file none: No such file or directory" in done.output
+
+
+@pytest.mark.parametrize("host", ["a..b", 64 * "a", "\udcff"])
+def test_what_can_be_no_host_is_refused(host: str) -> None:
+    """It was a traceback of the socket library."""
+    done = robot("client", f"{host}:5005")
+    assert done.exit_code == EXIT_USAGE
+    words = done.output.replace("│", " ").split()  # of a box, in which lines are broken
+    assert "cannot be the name of a host" in " ".join(words)
