@@ -88,7 +88,7 @@ class Stage(Plugin):
 class Source(Plugin):
     """Where frames come from."""
 
-    max_frames: int | None = Field(None, ge=1, description="stop after so many frames")
+    max_frames: int | None = Field(None, ge=1, lt=2**63, description="stop after so many frames")
     max_seconds: float | None = Field(
         None, gt=0, description="stop after so many seconds, by the stamps of the frames"
     )

@@ -82,7 +82,7 @@ def bench(
     recording: Annotated[
         str | None, typer.Argument(help="recording to play in place of the graph's source")
     ] = None,
-    frames: Annotated[int, typer.Option(help="frames to measure", min=10)] = 300,
+    frames: Annotated[int, typer.Option(help="frames to measure", min=10, max=10**6)] = 300,
     speed: Annotated[
         float,
         typer.Option(

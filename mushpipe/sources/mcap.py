@@ -33,7 +33,9 @@ class McapSource(RecordedSource, ReplaySource):
 
     path: GraphPath = Field(description="the recording")
     start: float = Field(0.0, ge=0, description="skip so many seconds of the recording")
-    end: float | None = Field(None, gt=0, description="stop at this second of the recording")
+    end: float | None = Field(
+        None, gt=0, le=1e9, description="stop at this second of the recording"
+    )
     loop: int = Field(1, ge=0, description="how many times to play it; 0 is for ever")
 
     _counts: Counter[str] = PrivateAttr(default_factory=Counter)

@@ -25,7 +25,7 @@ class SyntheticSource(SceneSettings, ReplaySource):
     truth of each frame travels beside it on `/truth/mushrooms` and `/truth/instances`.
     """
 
-    max_frames: int | None = Field(10, ge=1, description="number of frames")
+    max_frames: int | None = Field(10, ge=1, lt=2**63, description="number of frames")
     fps: float = Field(30, gt=0, le=1000, description="frames per second")
     step_mm: float = Field(
         0, ge=0, le=100, description="way of the gantry along x from frame to frame, mm"

@@ -74,6 +74,7 @@ class MakePicks(Stage):
     memory_s: float = Field(
         1.0,
         ge=0,
+        le=1e6,
         description="how long an id survives its mushroom unseen: longer than an arm hides it, and "
         "than the time between two pictures where that is over a second",
     )

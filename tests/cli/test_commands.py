@@ -385,3 +385,21 @@ def test_names_that_cannot_be_are_told_in_words(
     assert message in done.stderr
     assert done.returncode == EXIT_USAGE
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["run", "graph.yaml", "--frames", str(2**63)], "max_frames of 'synthetic'"),
+        (["run", "graph.yaml", "--source", "a.mcap", "--end", "1e300"], "end of 'mcap'"),
+        (["run", "graph.yaml", "--set", "pick.memory_s=1e300"], "memory_s of 'picks'"),
+        (["bench", "graph.yaml", "--frames", str(2**63)], "Invalid value for '--frames'"),
+    ],
+)
+def test_a_number_that_is_too_large_is_the_command_lines_fault(
+    folder: Path, arguments: list[str], message: str
+) -> None:
+    """It was an OverflowError, told as a failure of the source or the stage."""
+    done = mushpipe(*arguments, cwd=folder)
+    assert message in done.stderr
+    assert done.returncode == EXIT_USAGE
