@@ -110,6 +110,11 @@ class RgbdFrame:
             )
         object.__setattr__(self, "attached", MappingProxyType(dict(self.attached)))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return how to make it anew: what is read-only of `attached` cannot be pickled."""
+        parts = (self.header, self.color, self.depth, self.depth_scale, self.camera)
+        return RgbdFrame, (*parts, dict(self.attached))
+
     def _check_depth(self, depth: NDArray[Any]) -> None:
         if depth.dtype not in (np.uint16, np.float32):
             raise ValueError(f"depth is {depth.dtype}, expected uint16 or float32")
@@ -196,3 +201,8 @@ class Trace:
     def __post_init__(self) -> None:
         for name in ("outputs", "durations_ns"):  # other sinks see the same
             object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return how to make it anew: what is read-only cannot be pickled."""
+        parts = (self.frame, dict(self.outputs), dict(self.durations_ns), self.left_ns)
+        return Trace, parts

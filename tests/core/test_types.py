@@ -1,5 +1,7 @@
 """Frames and masks: what they check, what they compute."""
 
+import copy
+import pickle
 from dataclasses import replace
 from typing import Any
 
@@ -46,6 +48,17 @@ def test_no_sink_can_change_what_the_others_see():
             mapping["a"] = ()
     assert replace(trace, left_ns=7).outputs == {"a": (frame,)}
     assert replace(frame, depth_scale=0.5).attached == {"/truth": 1}
+
+
+def test_frames_and_traces_can_be_pickled_and_copied():
+    frame = RgbdFrame(HEADER, COLOR, np.ones((4, 6), np.uint16), 0.5, attached={"/truth": 1})
+    trace = Trace(frame, {"a": (COLOR,)}, {"a": 5}, 7)
+    for again in (pickle.loads(pickle.dumps(trace)), copy.deepcopy(trace)):
+        assert again.frame.attached == {"/truth": 1}
+        assert again.frame.depth_scale == 0.5
+        assert np.array_equal(again.frame.depth, frame.depth)
+        assert (again.durations_ns, again.left_ns) == ({"a": 5}, 7)
+        assert np.array_equal(again.outputs["a"][0], COLOR)
 
 
 def test_a_frame_is_locked():
