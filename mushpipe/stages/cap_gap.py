@@ -21,7 +21,9 @@ logger = logging.getLogger("mushpipe")
 # lie, px. At two, diameters are 1.5 mm off, and axes by 2 degrees more.
 ENOUGH, PATIENCE, AMISS, SHIFTED = 100, 60, 1.5, 2.0
 _OUTLIER = 2.0  # px from what is usual
-_LEAST_SPREAD = 0.15  # least eigenvalue of the normal matrix; 0.5 where all sides are alike
+# Least eigenvalue of the normal matrix; 0.5 where all sides are alike. A projector's shadow hides
+# depth beside each cap on one side: beds have 0.05 to 0.3, and tell shifts of 5 px to about 1 px.
+_LEAST_SPREAD = 0.05
 MOST, LEAST_RADIUS = 40, 14  # circles that are looked at: so many, of this radius, px, or more
 _DIRECTIONS, _STEP = 32, 0.5  # px between places along a direction
 _REACH, _SHARE = 8.0, 0.3  # looked at to both sides of a circle: px, or share of its radius

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from mushpipe import Camera, Circles, Header, Mask, RgbdFrame
+from mushpipe.core.truth import TRUTH_TOPIC
 from mushpipe.evaluate.truth import read_truth
 from mushpipe.sources.mcap import McapSource
 from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.cap_gap import EdgeWatch, edge_gaps, usual
 from mushpipe.stages.phase_hough import PhaseHough
-from tests.stages.frames import SIMULATED
+from tests.stages.frames import SIMULATED, simulated
 
 
 def disc(x: float, y: float, radius: float) -> np.ndarray:
@@ -112,6 +113,23 @@ def test_depth_that_is_not_aligned_to_colour_is_told_of(caplog: pytest.LogCaptur
     assert "not aligned to colour" in message
     (message,), _ = told(CapFit(), 1, caplog, right=-3)
     assert "px to the left" in message
+
+
+@pytest.mark.parametrize("right", [0, -3, -5, 5])
+def test_shadows_beside_all_caps_keep_nobody_from_telling(
+    right: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    watch = EdgeWatch()
+    for seed in range(9000, 9006):
+        frame = simulated(seed, width=640, height=480, count=80)
+        truth = frame.attached[TRUTH_TOPIC].take(frame.attached[TRUTH_TOPIC].ignore == 0)
+        assert frame.depth is not None
+        seen = replace(frame, depth=np.roll(frame.depth, right, axis=1))
+        watch.look(seen, Circles(truth.center, truth.radius, np.ones(len(truth))), 0.7)
+    found = [re.search(r"([\d.]+) px to the (left|right)", text) for text in caplog.messages]
+    told = [float(f[1]) * (1 if f[2] == "right" else -1) for f in found if f]
+    assert len(told) == len(found) == (right != 0)
+    assert told == pytest.approx([right] * len(told), abs=1.3)
 
 
 def test_edges_that_do_not_move_or_lie_on_one_side_are_no_evidence(
