@@ -62,6 +62,13 @@ def test_an_apex_far_from_its_cap_is_refused(apex: np.ndarray, message: str) -> 
         MakePicks().process(FRAME, CIRCLES, LOCATIONS, poses(apex))
 
 
+def test_one_bad_depth_ends_no_run() -> None:
+    """The paper's method takes a diameter from other pixels than the position."""
+    size = LOCATIONS.diameter * [30, 1]
+    found = MakePicks().process(FRAME, CIRCLES, replace(LOCATIONS, diameter=size), poses(POSITION))
+    assert len(found) == 2
+
+
 def test_without_a_calibration_a_location_is_in_front_of_the_camera_all_the_same() -> None:
     blind = replace(FRAME, camera=None)
     with pytest.raises(ValueError, match="not in front"):
