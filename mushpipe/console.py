@@ -9,7 +9,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +51,8 @@ def interruptible(stop: threading.Event) -> Iterator[None]:
             os._exit(EXIT_INTERRUPTED)
         stop.set()
         name = signal.Signals(number).name
-        stderr.print(f"{name}: finishing this frame; once more leaves at once", style="yellow")
+        with suppress(OSError, SystemExit):  # rich's, where Ctrl-C ended who reads it, too
+            stderr.print(f"{name}: finishing this frame; once more leaves at once", style="yellow")
 
     old = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:

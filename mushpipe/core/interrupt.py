@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from contextlib import suppress
 from typing import Any
 
 from mushpipe.core.errors import EXIT_INTERRUPTED
@@ -19,7 +20,8 @@ class _Interrupted(KeyboardInterrupt):
 
 
 def _say(number: int) -> None:
-    os.write(2, f"{signal.Signals(number).name}: interrupted\n".encode())
+    with suppress(OSError):  # Ctrl-C ends who reads it (`2>&1 | tee`), too
+        os.write(2, f"{signal.Signals(number).name}: interrupted\n".encode())
 
 
 def _leave(number: int, _: Any) -> None:
@@ -36,8 +38,9 @@ def _unwind(number: int, _: Any) -> None:
 def watch_import() -> None:
     """Leave at once while the program is imported and nothing open; do nothing to other ones."""
     program = sys.argv[0].rpartition("/")[2] if sys.argv else ""
-    ours = program in ("mushpipe", "-m")  # -m is replaced as soon as a module was found
-    if ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    if program == "-m":  # until a module was found: also while the package around it is imported
+        program = sys.orig_argv[-len(sys.argv)]
+    if program == "mushpipe" and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _leave)
 
 

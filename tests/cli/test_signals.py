@@ -112,6 +112,39 @@ def test_other_programs_keep_their_ctrl_c() -> None:
     assert done.stdout == "default_int_handler\n"
 
 
+def test_modules_of_packages_that_import_mushpipe_keep_their_ctrl_c(tmp_path: Path) -> None:
+    """Such a package is imported while `-m` still stands for the module."""
+    (tmp_path / "package").mkdir()
+    (tmp_path / "package" / "__init__.py").write_text("import mushpipe\n")
+    code = "import signal; print(signal.getsignal(signal.SIGINT).__name__)\n"
+    (tmp_path / "package" / "tool.py").write_text(code)
+    path = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
+    done = subprocess.run(
+        [sys.executable, "-m", "package.tool", "mushpipe"],
+        env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stdout == "default_int_handler\n"
+
+
+@pytest.mark.parametrize("verb", [["run"], ["bench", "--frames", "100000"]])
+def test_ctrl_c_may_end_who_reads_our_errors_first(tmp_path: Path, verb: list[str]) -> None:
+    """As with `2>&1 | tee`: it passed for a run without fault, whose frame was not finished."""
+    (tmp_path / "graph.yaml").write_text(GRAPH)
+    (tmp_path / "say.py").write_text(SAY)
+    read, write = os.pipe()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mushpipe", *verb, "graph.yaml"],
+        cwd=tmp_path, stdout=subprocess.PIPE, stderr=write, text=True,
+    )  # fmt: skip
+    os.close(write)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "frame\n"
+    os.close(read)
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=60)
+    assert process.returncode == EXIT_INTERRUPTED
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_bench_that_is_interrupted_says_so_and_leaves_nothing(
     tmp_path: Path, number: signal.Signals
