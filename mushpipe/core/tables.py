@@ -28,7 +28,9 @@ def locked(array: Any, dtype: Any) -> NDArray[Any]:
     (a camera's buffer, a bytearray) cannot be locked: what can be written there is copied.
     """
     if np.ma.is_masked(array):  # NumPy would take what is behind the mask
-        raise ValueError("it is a masked array; unknown is NaN: array.filled(np.nan)")
+        numbers = np.dtype(dtype or array.dtype)
+        unknown = "NaN: array.filled(np.nan)" if numbers.kind == "f" else "0: array.filled(0)"
+        raise ValueError(f"it is a masked array; unknown is {unknown}")
     result: NDArray[Any] = np.asarray(array, dtype, order="C")
     owner = result
     while isinstance(owner.base, np.ndarray):

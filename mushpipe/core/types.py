@@ -5,9 +5,11 @@ Frozen dataclasses, checked and locked on construction. The per-mushroom types s
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, fields
+from functools import cached_property, partial
+from numbers import Real
 from types import MappingProxyType
 from typing import Any
 
@@ -112,8 +114,7 @@ class RgbdFrame:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how to make it anew: what is read-only of `attached` cannot be pickled."""
-        parts = (self.header, self.color, self.depth, self.depth_scale, self.camera)
-        return RgbdFrame, (*parts, dict(self.attached))
+        return _anew(self)
 
     def _check_depth(self, depth: NDArray[Any]) -> None:
         if depth.dtype not in (np.uint16, np.float32):
@@ -125,8 +126,8 @@ class RgbdFrame:
                 f"depth has shape {depth.shape}, colour {self.color.shape[:2]}: "
                 "depth must be aligned to colour"
             )
-        if not (isinstance(self.depth_scale, int | float | np.number) and self.depth_scale > 0):
-            raise ValueError(f"depth_scale is {self.depth_scale}, expected metres per unit > 0")
+        if not (isinstance(self.depth_scale, Real) and 0 < self.depth_scale < math.inf):
+            raise ValueError(f"depth_scale is {self.depth_scale!r}, expected metres per unit > 0")
         object.__setattr__(self, "depth", depth)
 
     @cached_property
@@ -204,5 +205,12 @@ class Trace:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how to make it anew: what is read-only cannot be pickled."""
-        parts = (self.frame, dict(self.outputs), dict(self.durations_ns), self.left_ns)
-        return Trace, parts
+        return _anew(self)
+
+
+def _anew(value: RgbdFrame | Trace) -> tuple[Any, ...]:
+    """Return what makes a frame or trace, or one of a class of a plugin, from plain mappings."""
+    given = {each.name: getattr(value, each.name) for each in fields(value)}
+    plain = {k: dict(v) if isinstance(v, MappingProxyType) else v for k, v in given.items()}
+    its_class: Any = type(value)
+    return partial(its_class, **plain), ()

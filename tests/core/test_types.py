@@ -2,7 +2,7 @@
 
 import copy
 import pickle
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -59,6 +59,19 @@ def test_frames_and_traces_can_be_pickled_and_copied():
         assert np.array_equal(again.frame.depth, frame.depth)
         assert (again.durations_ns, again.left_ns) == ({"a": 5}, 7)
         assert np.array_equal(again.outputs["a"][0], COLOR)
+
+
+@dataclass(frozen=True, eq=False)
+class Thermal(RgbdFrame):
+    """As a plugin may have it."""
+
+    kelvin: float = 0.0
+
+
+def test_a_copied_frame_of_a_plugin_is_still_one():
+    again = copy.deepcopy(Thermal(HEADER, COLOR, kelvin=291.0))
+    assert (type(again), again.kelvin) == (Thermal, 291.0)
+    assert not again.color.flags.writeable
 
 
 def test_a_frame_is_locked():
@@ -179,6 +192,12 @@ def test_a_header_that_no_recording_could_hold_is_refused(values: Any, message: 
         ({"header": None}, "header of a frame is of type NoneType, expected Header"),
         ({"camera": np.eye(3)}, "camera of a frame is of type ndarray, expected Camera"),
         ({"depth_scale": None}, "depth_scale is None, expected metres per unit > 0"),
+        ({"depth_scale": np.inf}, "depth_scale is inf, expected metres per unit > 0"),
+        ({"depth_scale": np.array(0.001)}, r"depth_scale is array\(0.001\), expected metres"),
+        (
+            {"depth": np.ma.masked_equal(np.eye(3, dtype="u2")[:2], 0)},
+            r"masked array; unknown is 0: array.filled\(0\)",
+        ),
     ],
 )
 def test_a_frame_of_something_else_is_refused_by_name(values: Any, message: str) -> None:
