@@ -9,7 +9,7 @@ import numpy as np
 
 from mushpipe.core.arrays import Floats, Ints
 from mushpipe.core.truth import Ignore, Instances, Truth
-from mushpipe.sim.mushroom import Kind, Mushroom, turned_to
+from mushpipe.sim.mushroom import Kind, turned_to
 from mushpipe.sim.raycast import rays
 from mushpipe.sim.render import Surface
 from mushpipe.sim.world import View, World
@@ -81,8 +81,9 @@ def annotate(
     area = np.array([o.area for o in outlines])
     visible = np.minimum(seen[numbers] / area, 1.0) if len(numbers) else area
     across = [_across(world, k) for k in numbers.tolist()]
+    size = view.camera.width, view.camera.height
     reasons = [
-        _reason(m, o, float(v), view, largest_px)
+        reason_of((m.kind == Kind.STUMP, m.axis[2]), o, float(v), size, largest_px)
         for m, o, v in zip(mushrooms, outlines, visible, strict=True)
     ]
     truth = Truth(
@@ -115,17 +116,29 @@ def _across(world: World, number: int) -> Outline:
     return outline_around(points @ frame[:, :2])
 
 
-def _reason(
-    mushroom: Mushroom, outline: Outline, visible: float, view: View, largest_px: float
+def reason_of(
+    mushroom: tuple[bool, float],
+    outline: Outline,
+    visible: float,
+    size: tuple[int, int],
+    largest_px: float,
 ) -> Ignore:
-    """Return why a mushroom does not count; the first of several reasons."""
-    w, h = view.camera.width, view.camera.height
-    inside = (outline.center >= -0.5) & (outline.center < np.array([w, h]) - 0.5)
-    if mushroom.kind == Kind.STUMP:
+    """Return why a mushroom does not count; the first of several reasons.
+
+    Args:
+        mushroom: Whether it is a stump, and the cosine between its axis and the vertical.
+        outline: In the image, px.
+        visible: Share of it that is seen.
+        size: Width and height of the image, px.
+        largest_px: Outlines with a larger radius are too large.
+    """
+    stump, cosine = mushroom
+    inside = (outline.center >= -0.5) & (outline.center < np.array(size) - 0.5)
+    if stump:
         return Ignore.CUT_STUMP
-    if mushroom.axis[2] < UPRIGHT_COSINE:
+    if cosine < UPRIGHT_COSINE:
         return Ignore.NOT_UPRIGHT
-    if not inside.all() or outline.share_inside(w, h) < MIN_INSIDE:
+    if not inside.all() or outline.share_inside(*size) < MIN_INSIDE:
         return Ignore.AT_BORDER
     if outline.radius < SMALLEST_PX:
         return Ignore.TOO_SMALL

@@ -6,15 +6,8 @@ import numpy as np
 
 from mushpipe import Camera
 from mushpipe.core.arrays import Floats
-from mushpipe.core.truth import Ignore, Truth
-from mushpipe.sim.annotate import (
-    MIN_INSIDE,
-    MIN_VISIBLE,
-    SMALLEST_PX,
-    UPRIGHT_COSINE,
-    Outline,
-    outline_around,
-)
+from mushpipe.core.truth import Truth
+from mushpipe.sim.annotate import outline_around, reason_of
 from mushpipe.sim.mushroom import turned_to
 from training.traced.bed import Bed, Mushroom
 from training.traced.mesh import Mesh
@@ -31,8 +24,10 @@ def truth_of(bed: Bed, view: View, camera: Camera) -> Truth:
     outlines = [outline_around(camera.project(seen(bed, m.skin.vertices))) for m in grown]
     across = [outline_around(_along_axis(m)) for m in grown]
     visible = np.minimum(1, pixels[numbers] / [o.area for o in outlines])
+    size = camera.width, camera.height
     reasons = [
-        _reason(m, o, v, camera) for m, o, v in zip(grown, outlines, visible.tolist(), strict=True)
+        reason_of((m.rest is None, m.axis[2]), o, v, size, LARGEST_PX)
+        for m, o, v in zip(grown, outlines, visible.tolist(), strict=True)
     ]
     centers = np.array([o.center for o in outlines]).reshape(-1, 2)
     sights = [_surface(bed, m, camera, c) for m, c in zip(grown, centers, strict=True)]
@@ -54,23 +49,6 @@ def _along_axis(mushroom: Mushroom) -> Floats:
     """Return the skin (V, 2) m as seen along the axis from infinitely far."""
     points = mushroom.skin.vertices - mushroom.position
     return np.asarray(points @ turned_to(mushroom.axis, 0.0)[:, :2])
-
-
-def _reason(mushroom: Mushroom, outline: Outline, visible: float, camera: Camera) -> Ignore:
-    """Return why a mushroom does not count; the first of several reasons."""
-    w, h = camera.width, camera.height
-    inside = (outline.center >= -0.5) & (outline.center < np.array([w, h]) - 0.5)
-    if mushroom.rest is None:
-        return Ignore.CUT_STUMP
-    if mushroom.axis[2] < UPRIGHT_COSINE:
-        return Ignore.NOT_UPRIGHT
-    if not inside.all() or outline.share_inside(w, h) < MIN_INSIDE:
-        return Ignore.AT_BORDER
-    if outline.radius < SMALLEST_PX:
-        return Ignore.TOO_SMALL
-    if outline.radius > LARGEST_PX:
-        return Ignore.TOO_LARGE
-    return Ignore.HIDDEN if visible < MIN_VISIBLE else Ignore.COUNTS
 
 
 def _apex(bed: Bed, mushroom: Mushroom) -> Floats:
