@@ -50,7 +50,7 @@ def _require_size(circles: Circles, locations: Locations, poses: Poses, camera: 
     A unit is wrong in all rows. In one it is a depth that is wrong, as the method of that row says:
     the paper's takes position and diameter from different pixels.
     """
-    across = 2 * circles.radius * locations.position[:, 2] / np.sqrt(camera.fx * camera.fy)
+    across = 2 * circles.radius * locations.position[:, 2] / camera.focal
     differs = _differ(locations.diameter, across)
     if (row := _usual(differs, locations.diameter)) is not None:
         raise ValueError(
