@@ -55,7 +55,7 @@ class Mesh:
         return Mesh(vertices, self.triangles, self.texture, self.material)
 
 
-def _quads(rows: int, columns: int, wrap: bool) -> Ints:
+def quads(rows: int, columns: int, wrap: bool) -> Ints:
     """Return the triangles of a grid of rows x columns vertices, closed along a row if `wrap`."""
     index = np.arange(rows * columns).reshape(rows, columns)
     right = np.roll(index, -1, axis=1) if wrap else index[:, 1:]
@@ -71,7 +71,7 @@ def sheet(rings: Floats, material: Material, texture: Floats | None = None) -> M
     A first or last ring that is a single point becomes a pole.
     """
     n, m, _ = rings.shape
-    triangles = _quads(n, m, wrap=True)
+    triangles = quads(n, m, wrap=True)
     for ring in (0, n - 1):
         if np.ptp(rings[ring], axis=0).max() < 1e-12:
             inside = (triangles >= ring * m) & (triangles < (ring + 1) * m)
@@ -93,7 +93,7 @@ def height_field(x: Reals, y: Reals, height: Reals, material: Material) -> Mesh:
     """Return the surface z = height (H, W) over columns x (W,) and rows y (H,), y descending."""
     grid = np.stack([*np.meshgrid(x, y), height], axis=-1)
     flat = grid.reshape(-1, 3).astype(np.float64)
-    return Mesh(flat, _quads(len(y), len(x), wrap=False), flat, material)
+    return Mesh(flat, quads(len(y), len(x), wrap=False), flat, material)
 
 
 def box(size: Sequence[float], material: Material) -> Mesh:

@@ -45,7 +45,7 @@ class ColorCamera(Group):
             grain = rng.standard_normal(image.shape, np.float32)
             color = cv2.GaussianBlur(grain, (0, 0), 0.6) * 1.6  # demosaicing spreads noise
             image = image + sigma * color
-        codes = np.rint(255 * _srgb(_shoulder(_contrast(image)))).astype(np.uint8)
+        codes = np.rint(255 * srgb(_shoulder(_contrast(image)))).astype(np.uint8)
         return _jpeg(codes, self.jpeg_quality) if self.jpeg_quality else codes
 
 
@@ -60,7 +60,7 @@ def _shoulder(image: Singles) -> Singles:
     return np.asarray(np.minimum(image, 0.7) + 0.3 * (1 - np.exp(-over / 0.3)))
 
 
-def _srgb(linear: Singles) -> Singles:
+def srgb(linear: Singles) -> Singles:
     """Encode linear light 0..1 by the transfer curve of IEC 61966-2-1."""
     x = np.clip(linear, 0, 1)
     return np.asarray(np.where(x < 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055))

@@ -5,11 +5,12 @@ import pytest
 
 from mushpipe import Camera
 from mushpipe.core.truth import Ignore
+from mushpipe.sim.mesh import quads
 from mushpipe.sim.mushroom import turned_to
 from training.traced import things
 from training.traced.bed import Bed, Mushroom, drawn
 from training.traced.cameras import OFFSET, UNIT, _hidden, coded_light, stereo
-from training.traced.mesh import Mesh, grid_triangles
+from training.traced.mesh import Mesh
 from training.traced.render import View, seen
 from training.traced.truth import first_hit, truth_of
 
@@ -22,7 +23,7 @@ def ball(center, radius, rows=120, columns=240):
     polar, turn = np.linspace(1e-6, np.pi - 1e-6, rows), np.arange(columns) * 2 * np.pi / columns
     p, t = np.meshgrid(polar, turn, indexing="ij")
     points = np.stack([np.sin(p) * np.cos(t), np.sin(p) * np.sin(t), np.cos(p)], -1).reshape(-1, 3)
-    return Mesh(center + radius * points, grid_triangles(rows, columns, True), np.ones_like(points))
+    return Mesh(center + radius * points, quads(rows, columns, True), np.ones_like(points))
 
 
 def plane_view(depth):

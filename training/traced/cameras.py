@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.arrays import Bools, Floats, Singles
+from mushpipe.sim.photo import srgb
 from training.traced.render import View
 
 OFFSET = 0.00285  # m that both read too far, as graphs/pick.yaml has it corrected
@@ -27,9 +28,7 @@ def photograph(light: Singles, rng: np.random.Generator) -> NDArray[np.uint8]:
     gains = (balance / balance[1]) ** rng.uniform(0, 1)
     image = cv2.GaussianBlur(light * (exposure * gains).astype(np.float32), (0, 0), 0.6)
     image += np.sqrt(3e-5 + 2e-4 * np.maximum(image, 0)) * rng.standard_normal(image.shape)
-    x = np.clip(image, 0, 1)
-    coded = np.where(x < 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
-    return np.asarray(np.rint(255 * coded), np.uint8)
+    return np.asarray(np.rint(255 * srgb(image)), np.uint8)
 
 
 def coded_light(view: View, fx: float, rng: np.random.Generator) -> NDArray[np.uint16]:

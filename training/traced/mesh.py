@@ -40,16 +40,6 @@ def joined(meshes: list[Mesh]) -> Mesh:
     )
 
 
-def grid_triangles(rows: int, columns: int, closed: bool) -> Ints:
-    """Return the triangles between the points of a grid, its last column joined to the first."""
-    number = np.arange(rows * columns).reshape(rows, columns)
-    if closed:
-        number = np.column_stack([number, number[:, 0]])
-    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
-    pairs = np.stack([np.stack([a, c, b], -1), np.stack([b, c, d], -1)])
-    return np.asarray(pairs.reshape(-1, 3))
-
-
 def waves(points: Floats, grain: float, rng: np.random.Generator) -> Floats:
     """Return smooth noise (...,) of mean 0 and variance 1 at points (..., 3) m.
 

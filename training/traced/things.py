@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 
 from mushpipe.core.arrays import Floats
-from training.traced.mesh import Mesh, grid_triangles, joined, mixed, waves
+from mushpipe.sim.mesh import quads
+from training.traced.mesh import Mesh, joined, mixed, waves
 
 SEGMENTS = 96
 _STEP = 0.0009  # m between the points of the soil
@@ -63,10 +64,10 @@ def cap(radius: float, color: str, rng: np.random.Generator) -> tuple[Mesh, Mesh
     rim = outside[-1]
     inside = np.stack([rim * (1 - t) + t * rim.mean(axis=0) * [1, 1, 0.4] for t in (0, 0.4, 0.75)])
     points = outside.reshape(-1, 3)
-    skin = Mesh(points, grid_triangles(len(outside), SEGMENTS, True), _skin(points, color, rng))
+    skin = Mesh(points, quads(len(outside), SEGMENTS, True), _skin(points, color, rng))
     gills = inside.reshape(-1, 3)
     shade = np.tile(_GILLS * rng.uniform(0.5, 1.6), (len(gills), 1))
-    return skin, Mesh(gills, grid_triangles(3, SEGMENTS, True), shade)
+    return skin, Mesh(gills, quads(3, SEGMENTS, True), shade)
 
 
 def _lobed(
@@ -113,7 +114,7 @@ def stem(start: Floats, end: Floats, radius: float, rng: np.random.Generator) ->
     points += 0.03 * radius * waves(points, 0.4 * radius, rng)[:, None] * [1, 1, 0]
     colors = np.tile(np.array([0.76, 0.71, 0.62]) * rng.uniform(0.7, 1.1), (len(points), 1))
     colors = mixed(colors, np.array(SOILS["peat"]), 0.5 * (waves(points, 0.003, rng) - 1))
-    return Mesh(points, grid_triangles(14, len(angle), True), colors)
+    return Mesh(points, quads(14, len(angle), True), colors)
 
 
 def stump(place: Floats, radius: float, length: float, rng: np.random.Generator) -> Mesh:
@@ -126,7 +127,7 @@ def stump(place: Floats, radius: float, length: float, rng: np.random.Generator)
     points = rings.reshape(-1, 3)
     colors = np.tile(_CUT * rng.uniform(0.6, 1.1), (len(points), 1))
     colors = mixed(colors, np.array([0.4, 0.26, 0.15]), 0.3 * waves(points, 0.003, rng))
-    return joined([side, Mesh(points, grid_triangles(4, SEGMENTS // 2, True), colors)])
+    return joined([side, Mesh(points, quads(4, SEGMENTS // 2, True), colors)])
 
 
 def clod(place: Floats, radius: float, color: Floats, rng: np.random.Generator) -> Mesh:
@@ -141,7 +142,7 @@ def clod(place: Floats, radius: float, color: Floats, rng: np.random.Generator) 
     points *= 1 + rough * lumps[:, None]
     shade = 1 + 0.35 * waves(points, 0.25 * radius, rng)
     colors = np.clip(color * shade[:, None], 0.005, 0.9)
-    return Mesh(points + place, grid_triangles(rows, sphere.shape[1], True), colors)
+    return Mesh(points + place, quads(rows, sphere.shape[1], True), colors)
 
 
 def soil(half: tuple[float, float], color: Floats, white: float, rng: np.random.Generator) -> Mesh:
@@ -158,7 +159,7 @@ def soil(half: tuple[float, float], color: Floats, white: float, rng: np.random.
     if white:
         patch = (_field(shape, 0.03, rng) + 0.6 * _field(shape, 0.004, rng)).ravel()
         colors = mixed(colors, MYCELIUM, 2 * (patch - np.quantile(patch, 1 - white)))
-    return Mesh(points, grid_triangles(*shape, False), colors)
+    return Mesh(points, quads(*shape, False), colors)
 
 
 def _field(shape: tuple[int, int], grain: float, rng: np.random.Generator) -> Floats:
