@@ -14,36 +14,11 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.arrays import Bools, Bytes, Floats, Ints
+from mushpipe.core.arrays import Bools, Bytes, Floats, Ints, locked
 from mushpipe.core.geometry import axis_from_quaternion
 
 AXIS_TOLERANCE = 1e-3
 _EXACTLY = "must be finite exactly where its source is not MISSING"
-
-
-def locked(array: Any, dtype: Any) -> NDArray[Any]:
-    """Return the array as C-contiguous dtype, read-only; itself where nothing needs converting.
-
-    What it is a view of becomes read-only too, or it could still change. Memory that is not numpy's
-    (a camera's buffer, a bytearray) cannot be locked: what can be written there is copied.
-    """
-    if np.ma.is_masked(array):  # NumPy would take what is behind the mask
-        numbers = np.dtype(dtype or array.dtype)
-        unknown = "NaN: array.filled(np.nan)" if numbers.kind == "f" else "0: array.filled(0)"
-        raise ValueError(f"it is a masked array; unknown is {unknown}")
-    result: NDArray[Any] = np.asarray(array, dtype, order="C")
-    owner = result
-    while isinstance(owner.base, np.ndarray):
-        owner = owner.base
-    # numba's is reached through its arrays alone
-    foreign = owner.base is not None and type(owner.base).__name__ != "_MemInfo"
-    if foreign and owner.flags.writeable:
-        result = result.copy()
-    part: Any = result
-    while isinstance(part, np.ndarray):
-        part.flags.writeable = False
-        part = part.base
-    return result
 
 
 def _as_given(array: NDArray[Any], given: Any) -> bool:

@@ -11,8 +11,8 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.arrays import Bytes, Floats, Ints
-from mushpipe.core.tables import Circles, Columns, Locations, Picks, Poses, column, first_of, locked
+from mushpipe.core.arrays import Bytes, Floats, Ints, locked
+from mushpipe.core.tables import Circles, Columns, Locations, Picks, Poses, column, first_of
 
 TRUTH_TOPIC = "/truth/mushrooms"
 INSTANCES_TOPIC = "/truth/instances"

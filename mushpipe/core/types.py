@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.arrays import Bools, Bytes, Singles
+from mushpipe.core.arrays import Bools, Bytes, Singles, locked
 from mushpipe.core.geometry import Camera
-from mushpipe.core.tables import locked
 
 _FARTHEST_M = 1e5  # the largest number of millimetres that is taken for metres is less
 _LATEST_NS = 2**32 * 10**9 - 1  # seconds are recorded in 32 bits

@@ -12,9 +12,8 @@ import math
 import numpy as np
 
 from mushpipe import Circles
-from mushpipe.core.arrays import Bools, Bytes, Floats
+from mushpipe.core.arrays import Bools, Bytes, Floats, locked
 from mushpipe.core.jit import borrower
-from mushpipe.core.tables import locked
 from mushpipe.stages.cap_kin import DARK, UNIT, Kin, distances, write_tone
 from mushpipe.stages.discs import discs_of
 

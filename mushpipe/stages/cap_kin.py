@@ -13,9 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from mushpipe import Circles
-from mushpipe.core.arrays import Bytes, Floats, Ints
+from mushpipe.core.arrays import Bytes, Floats, Ints, locked
 from mushpipe.core.jit import borrower, jit
-from mushpipe.core.tables import locked
 from mushpipe.stages.discs import discs_of
 
 SURE = 0.9  # score of what is surely a cap

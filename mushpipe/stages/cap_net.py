@@ -11,11 +11,10 @@ import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
 
 from mushpipe import Circles, GraphPath, Header, Mask, RgbdFrame, Stage
-from mushpipe.core.arrays import Bools, Bytes, Floats, Singles
+from mushpipe.core.arrays import Bools, Bytes, Floats, Singles, locked
 from mushpipe.core.errors import UsageError
 from mushpipe.core.jit import borrower
 from mushpipe.core.onnx_file import OnnxFile
-from mushpipe.core.tables import locked
 from mushpipe.core.types import end_of_scale
 from mushpipe.stages.cap_decode import CHANNELS, MASK, STRIDE, circles_of, first_of_each
 from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE, certain_first, discs_of

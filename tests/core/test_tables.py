@@ -22,7 +22,7 @@ from mushpipe import (
     RgbdFrame,
     column,
 )
-from mushpipe.core.tables import locked
+from mushpipe.core.arrays import locked
 from mushpipe.core.truth import Ignore, Instances, Truth
 
 NAN = np.nan
