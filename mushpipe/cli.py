@@ -14,9 +14,9 @@ import typer
 
 from mushpipe.doctor import register as register_doctor
 from mushpipe.evaluate.cli import register as register_eval
+from mushpipe.options import file_argument
 from mushpipe.output import Output, OutputOption
 from mushpipe.proof.cli import register as register_proof
-from mushpipe.reading import file_argument
 from mushpipe.record import register as register_record
 from mushpipe.robot.commands import app as robot_app
 from mushpipe.viewing import register as register_viewing

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mushpipe.reading import file_argument
+from mushpipe.options import file_argument
 
 if TYPE_CHECKING:
     from mushpipe.sinks.rerun import RerunSink

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mushpipe.finite import finite
+from mushpipe.options import file_argument, file_option, finite
 from mushpipe.output import Output, OutputOption
-from mushpipe.reading import file_argument, file_option
 
 if TYPE_CHECKING:
     from mushpipe.core.plan import Plan

@@ -13,13 +13,24 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mushpipe.finite import finite
-from mushpipe.reading import file_argument, file_option
+from mushpipe.options import file_argument, file_option, finite
 
 if TYPE_CHECKING:
     from mushpipe.core.plan import Plan
     from mushpipe.proof.compare import Comparison, Difference
 
+SpeedOption = Annotated[
+    float,
+    typer.Option(
+        min=0, callback=finite, help="pace of the replay: 1 is real time, 0 as fast as it goes"
+    ),
+]
+AllowOption = Annotated[
+    float,
+    typer.Option(
+        min=1, callback=finite, help="exit with 3 where a median is more times the baseline's"
+    ),
+]
 _FIGURES = (
     *("frames", "failed", "frames_per_s", "cpu_ms_per_frame", "cores_busy"),
     *("allocated_mb_per_frame", "peak_memory_mb", "memory_growth_mb"),
@@ -83,12 +94,7 @@ def bench(
         str | None, typer.Argument(help="recording to play in place of the graph's source")
     ] = None,
     frames: Annotated[int, typer.Option(help="frames to measure", min=10, max=10**6)] = 300,
-    speed: Annotated[
-        float,
-        typer.Option(
-            min=0, callback=finite, help="pace of the replay: 1 is real time, 0 as fast as it goes"
-        ),
-    ] = 0.0,
+    speed: SpeedOption = 0.0,
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="A.B=VALUE", help="change a setting")
     ] = None,
@@ -96,12 +102,7 @@ def bench(
     baseline: Annotated[
         Path | None, file_option("figures of an earlier run, to compare with")
     ] = None,
-    allow: Annotated[
-        float,
-        typer.Option(
-            min=1, callback=finite, help="exit with 3 where a median is more times the baseline's"
-        ),
-    ] = 1.5,
+    allow: AllowOption = 1.5,
 ) -> None:
     """Measure a graph: time of every node, latency, frames/s, CPU, memory.
 

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mushpipe.finite import finite
-from mushpipe.reading import file_argument, file_option
+from mushpipe.options import file_argument, file_option, finite
 
 if TYPE_CHECKING:
     import ssl

@@ -1,0 +1,35 @@
+"""What arguments and options of several verbs have in common."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import typer
+
+
+def file_argument(description: str) -> Any:
+    """Return the argument of a verb that names what it reads.
+
+    Whether a file can be read is said where it is read, alike for every verb and for a graph's
+    source. Typer would look first, in other words and with another exit code.
+    """
+    return typer.Argument(help=description, readable=False)
+
+
+def file_option(description: str) -> Any:
+    """Return the same as an option."""
+    return typer.Option(help=description, readable=False)
+
+
+def finite(value: float) -> float:
+    """Return a number, as the callback of an option.
+
+    Typer's bounds alone let infinity pass, and some versions NaN.
+
+    Raises:
+        BadParameter: It is NaN or infinite.
+    """
+    if not math.isfinite(value):
+        raise typer.BadParameter(f"{value} is no finite number")
+    return value
