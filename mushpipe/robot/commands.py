@@ -164,10 +164,13 @@ def _converse(connection: RobotClient, talk: _Talk) -> None:
 
 def _token(path: Path) -> str:
     try:
-        return path.read_text().strip()
+        token = path.read_text().strip()
     except (OSError, UnicodeDecodeError) as error:
         why = getattr(error, "strerror", None) or "it is no text"
         raise typer.BadParameter(f"--token-file {path}: {why}") from error
+    if not token:
+        raise typer.BadParameter(f"--token-file {path}: there is no token in it")
+    return token
 
 
 def _trust(path: Path) -> ssl.SSLContext:

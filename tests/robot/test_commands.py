@@ -212,13 +212,18 @@ def test_the_example_picks() -> None:
     assert [line.split()[0] for line in done.stdout.splitlines()] == ["m0", "m1", "m2"]
 
 
-def test_a_token_that_cannot_be_read_is_not_the_servers_fault(tmp_path: Path) -> None:
-    path = tmp_path / "robot.mcap"
-    record(path)
-    for verb in (["client", "127.0.0.1:1"], ["replay", path, "--connect", "127.0.0.1:1"]):
-        done = robot(*verb, "--token-file", "none")
-        assert done.exit_code == EXIT_USAGE
-        assert "--token-file none: No such file or directory" in done.output
+def test_a_token_that_cannot_be_read_is_not_the_servers_fault(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    record(tmp_path / "robot.mcap")
+    Path("empty").write_text("\n")
+    at = "127.0.0.1:1"
+    for verb in (["client", at], ["replay", "robot.mcap", "--connect", at]):
+        for file, why in (("none", "No such file or directory"), ("empty", "there is no token")):
+            done = robot(*verb, "--token-file", file)
+            assert done.exit_code == EXIT_USAGE
+            assert f"--token-file {file}: {why}" in done.output
 
 
 @pytest.mark.parametrize("host", ["a..b", 64 * "a", "\udcff"])
