@@ -17,7 +17,13 @@ from mushpipe.core.jit import borrower
 from mushpipe.core.onnx_file import OnnxFile
 from mushpipe.core.types import end_of_scale
 from mushpipe.stages.cap_decode import CHANNELS, MASK, STRIDE, circles_of, first_of_each
-from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE, certain_first, discs_of
+from mushpipe.stages.discs import (
+    LEAST_OF_RANGE,
+    MOST_OF_RANGE,
+    certain_first,
+    discs_of,
+    many_likely,
+)
 from mushpipe.stages.letterbox import resized
 
 FILE = "cap_net.onnx"
@@ -29,6 +35,9 @@ _LARGEST_SCALE = 4.0
 _LEAST_KNOWN = 0.35  # share of the pixels with depth from which on depth tells enough
 # Depth shrinks the image in such steps: every size of it has a session of its own.
 _STEP, _LEAST_SCALE = 0.8, 0.2
+# px; where few caps were seen, an image less wide than the training's is asked for larger radii
+# alone: nothing tells then what caps look like here, and cups look like caps in small images.
+_WIDTH, _LARGE = 640, 45.0
 _CLEARLY = 1.25  # so much more of the image circles at another scale must explain
 
 
@@ -113,10 +122,12 @@ class CapNet(Stage):
         while further and scale / 2 >= _LEAST_SCALE:
             # Nothing tells how large caps are, but that more is explained at the scale they are of.
             scale /= 2
-            other = self._look(frame.color, scale, _KNOWN[1] / scale)
-            if further := _explained(other[1]) > _CLEARLY * _explained(found):
-                mask = Mask(mask.foreground | other[0].foreground)
-                found = self._together(found, other[1])
+            seen, coarse = self._look(frame.color, scale, _KNOWN[1] / scale)
+            if max(frame.color.shape) * scale < _WIDTH and not many_likely(found):
+                coarse = coarse.take(coarse.radius >= _LARGE / (2 * scale))
+            if further := _explained(coarse) > _CLEARLY * _explained(found):
+                mask = Mask(mask.foreground | seen.foreground)
+                found = self._together(found, coarse)
         return mask, found
 
     def _together(self, fine: Circles, coarse: Circles) -> Circles:

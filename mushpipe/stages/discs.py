@@ -14,6 +14,8 @@ from mushpipe.core.tables import Circles
 
 # Radii are no more exact than a tenth: by so much an outline may be beyond a range of radii.
 LEAST_OF_RANGE, MOST_OF_RANGE = 0.9, 1.1
+LIKELY = 0.5  # score from which on a circle is more likely a cap than not
+_MANY = 5  # caps that tell what caps look like here
 
 
 class Radii(NamedTuple):
@@ -37,6 +39,11 @@ def discs_of(circles: Circles) -> Floats:
 def certain_first(circles: Circles) -> Circles:
     """Return the circles in the order of their scores."""
     return circles.take(np.argsort(-circles.score, kind="stable"))
+
+
+def many_likely(circles: Circles) -> bool:
+    """Return whether enough circles are likely caps to tell what caps look like in this image."""
+    return int(np.count_nonzero(circles.score >= LIKELY)) >= _MANY
 
 
 def radii_on_rays(circles: Circles, camera: Camera) -> Floats:

@@ -15,7 +15,7 @@ import numpy as np
 
 from mushpipe.core.arrays import Bools, Floats, Ints32, Singles
 from mushpipe.core.jit import borrower, jit
-from mushpipe.stages.discs import lens
+from mushpipe.stages.discs import LIKELY, lens
 from mushpipe.stages.phase_features import AT_LEARNED
 from mushpipe.stages.phase_refit import COSINES, HIDDEN, NARROW, SINES, reach_of, tolerance
 from mushpipe.stages.phase_scratch import Scratch, scratch_for
@@ -24,7 +24,6 @@ from mushpipe.stages.verifier_net import Models, probability
 
 MARGIN = 1.0  # px; so far within an accepted circle an outline counts as hidden by it
 HOPELESS = 2e-5  # probability from which on nothing that is accepted later can help
-LIKELY = 0.5  # probability from which on a circle is more likely a cap than not
 TAKEN = 2.5  # px; edges so near an accepted outline are its own
 
 

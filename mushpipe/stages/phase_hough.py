@@ -12,10 +12,10 @@ from pydantic import Field, PrivateAttr, model_validator
 from mushpipe import Circles, Mask, RgbdFrame, Stage, UsageError
 from mushpipe.core.arrays import Bools, Bytes, Floats, Ints32, Singles
 from mushpipe.core.paths import GraphPath
-from mushpipe.stages.discs import Radii, certain_first
+from mushpipe.stages.discs import LIKELY, Radii, certain_first, many_likely
 from mushpipe.stages.doubling import doubled
 from mushpipe.stages.phase_blobs import blobs_of
-from mushpipe.stages.phase_decide import LIKELY, decide
+from mushpipe.stages.phase_decide import decide
 from mushpipe.stages.phase_depth import NO_RELIEF, Relief, relief_of
 from mushpipe.stages.phase_edges import Gradient, edges_of, gradient_of, otsu_of
 from mushpipe.stages.phase_features import AT_LEARNED, static_features
@@ -45,7 +45,9 @@ _STANDING = 0.004  # m; what is higher than this over the bed is looked at, in t
 EVIDENCE = 0.07  # share of an outline that votes; half-hidden caps show hardly more
 _BESIDE = 0.2  # the same beside a network: what has less it sees as well, and fewer cost less time
 _EVERY = 2  # edge points; of so many one votes where network and depth bring candidates as well
-_SEEN = 0.1  # of `learned`; without depth, what the network sees less of is no cap
+# Of `learned`; without depth, what the network sees less of is no cap. Where it sees few caps, cups
+# are as many as the caps that it doubts, and look like these to the verifier.
+_SEEN, _SEEN_OF_FEW = 0.1, 0.35
 _SURE = 0.8  # of a network's circle, from which on it is taken for a cap though it has no outline
 _LARGE = 80.0  # px; radius up to which caps are looked for in any case where [8, null] is set
 _SMALLEST = 12  # px; images smaller than this in either direction hold no circle
@@ -207,7 +209,8 @@ class PhaseHough(Stage):
             table[:, AT_LEARNED] = agreement(shapes, equal_area_radius(shapes), learned)
         kept = self._plausible(shapes, middle, relief)
         if learned is not None:
-            kept &= np.isfinite(middle) | (table[:, AT_LEARNED] >= _SEEN)
+            least = _SEEN if relief.known or many_likely(learned) else _SEEN_OF_FEW
+            kept &= np.isfinite(middle) | (table[:, AT_LEARNED] >= least)
         parts = (shapes[kept], hits[kept], table[kept], middle[kept])
         return Evidence(edges, *parts, relief, radii, known)
 
