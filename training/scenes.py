@@ -128,9 +128,13 @@ def choosing_cases(cache: Path) -> Iterator[Case]:
             yield render(condition, "a", CHOOSING_SEED + 5 * number + k, cache)
 
 
-def judging_cases(cache: Path, count: int = 3) -> Iterator[Case]:
-    """Yield frames for judging only: per condition `count` of each family, unseen seeds."""
+def judging_cases(cache: Path, count: int = 3, tables: int = 1) -> Iterator[Case]:
+    """Yield frames for judging only: per condition `count` of each family, unseen seeds.
+
+    Tables hold few caps: so many times as many frames of them.
+    """
     for number, condition in enumerate(JUDGED):
+        times = tables if CONDITIONS[condition].get("scene") == "lab" else 1
         for family in "ab":
-            for k in range(count):
+            for k in range(times * count):
                 yield render(condition, family, JUDGING_SEED + 20 * number + k, cache)

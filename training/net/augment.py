@@ -13,6 +13,7 @@ from training.net.texture import NOISE, textured
 
 SMALLEST = 5.0  # px; smaller outlines are not asked for
 HIDDEN = 0.3  # nor are those of which less is seen
+_BLUR = np.log([0.3, 3.0])  # px
 
 
 def crop(
@@ -31,7 +32,7 @@ def crop(
         rng: Draws everything.
         near: Share of the crops that are taken around a cap; the others lie anywhere.
         stained: Whether caps and bed may be blotched, overexposed, and set one against the other.
-        surfaces: Whether they may have other surfaces, and caps shade each other.
+        surfaces: Whether they may have other surfaces, shade each other, and be blurred more.
     """
     matrix, scale = _placement(picture, size, rng, near)
     color = cv2.warpAffine(
@@ -44,7 +45,7 @@ def crop(
     circles = np.column_stack([center, picture.circles[:, 2] * scale])
     if surfaces:
         image = textured(image, cap, circles, rng)
-    image = photographed(image, cap, rng, stained)
+    image = photographed(image, cap, rng, stained, surfaces)
     stump = picture.kind == Ignore.CUT_STUMP
     target, weight = aims(circles[~stump], (picture.visible < HIDDEN)[~stump], size // STRIDE)
     target[MASK] = cv2.resize(cap, None, fx=1 / STRIDE, fy=1 / STRIDE, interpolation=cv2.INTER_AREA)
@@ -101,7 +102,11 @@ def aims(circles: Floats, unsure: Bools, cells: int) -> tuple[Singles, Singles]:
 
 
 def photographed(
-    image: Singles, cap: Singles, rng: np.random.Generator, stained: bool = False
+    image: Singles,
+    cap: Singles,
+    rng: np.random.Generator,
+    stained: bool = False,
+    blurred: bool = False,
 ) -> Singles:
     """Return an image (H, W, 3) with other colours, light, blur, noise and things before it."""
     if rng.random() < 0.4:  # other caps on the same bed
@@ -121,7 +126,8 @@ def photographed(
         image = overexposed(image, cap, rng)
     image = _patches(image, rng)
     if rng.random() < 0.4:
-        image = cv2.GaussianBlur(image, (0, 0), rng.uniform(0.3, 1.5))
+        sigma = np.exp(rng.uniform(*_BLUR)) if blurred else rng.uniform(0.3, 1.5)
+        image = cv2.GaussianBlur(image, (0, 0), float(sigma))
     start = rng.integers(len(NOISE) - image.size)
     noise = NOISE[start : start + image.size].reshape(image.shape)
     image += noise * np.float32(rng.exponential(0.015))

@@ -41,13 +41,14 @@ FITTED = {  # down to a low score, for `cap-fit` to decide; at last without dept
 }
 
 EACH, VARIED = 3, 16  # frames of a row per shape family, and of `varied`
+TABLES = 4  # times as many frames of a table, which holds few caps
 
 
 def scenes(cache: Path, choosing: bool, each: int = EACH, varied: int = VARIED) -> Iterator[Case]:
     """Yield the frames to judge on, so many per row and family, or those for choices of design."""
     if choosing:
         return chain(choosing_cases(cache), varied_cases(cache, CHOOSING_SEED, "a", 60))
-    return chain(judging_cases(cache, each), varied_cases(cache, JUDGING_SEED, "b", varied))
+    return chain(judging_cases(cache, each, TABLES), varied_cases(cache, JUDGING_SEED, "b", varied))
 
 
 def simulated(models: list[Path], cases: Iterator[Case], peers: bool) -> str:

@@ -23,7 +23,7 @@ from training.net.augment import crop
 from training.net.model import CapNet, loss_of
 from training.net.scenes import TRAINING, TRAINING_SEED, Picture, pictures
 
-SIZE, BATCH, RATE, DECAY = 224, 8, 2.5e-3, 0.998
+SIZE, BATCH, RATE, DECAY, WARM_UP = 224, 8, 2.5e-3, 0.998, 100
 NEAR = 0.3  # share of the crops that are taken around a cap
 
 Batch = tuple[torch.Tensor, ...]
@@ -56,49 +56,55 @@ class Crops(IterableDataset[Batch]):
 class Learner:
     """A network that learns, and the running mean of its weights.
 
-    AdamW with a linear warm-up over 100 steps and a cosine to zero.
+    AdamW. The rate of learning and how fast the mean moves lie in tensors, so that a step may be a
+    CUDA graph, which takes no numbers.
 
     Attributes:
         net: What learns.
         slow: The same with the mean of its weights; this one is used in the end.
     """
 
-    def __init__(self, net: CapNet, steps: int, rate: float, decay: float = DECAY) -> None:
+    def __init__(self, net: CapNet, rate: float, decay: float = DECAY) -> None:
         self.net = net.to(memory_format=torch.channels_last)
         self.slow = copy.deepcopy(self.net)
-        self._steps, self._decay = steps, decay
-        self._optimizer = torch.optim.AdamW(net.parameters(), rate, weight_decay=1e-3)
-        self._schedule = torch.optim.lr_scheduler.LambdaLR(self._optimizer, self._rate)
+        self._most, self._decay = rate, decay
+        self._weights = list(net.parameters())
+        device = self._weights[0].device
+        self._rate, self._away = torch.tensor(rate, device=device), torch.ones((), device=device)
+        graph = device.type == "cuda"
+        self._optimizer = torch.optim.AdamW(
+            self._weights, self._rate, weight_decay=1e-3, capturable=graph, fused=graph
+        )
+        states = zip(self.slow.state_dict().values(), self.net.state_dict().values(), strict=True)
+        self._pairs = [pair for pair in states if pair[0].is_floating_point()]
 
-    def _rate(self, step: int) -> float:
-        return min(1.0, (step + 1) / 100) * 0.5 * (1 + math.cos(math.pi * step / self._steps))
+    def prepare(self, step: int, steps: int) -> None:
+        """Set how much is learnt in a step: warm-up over `WARM_UP` steps, then a cosine to zero.
+
+        The mean moves faster at the start.
+        """
+        cosine = 0.5 * (1 + math.cos(math.pi * step / steps))
+        self._rate.fill_(self._most * cosine * min(1.0, (step + 1) / WARM_UP))
+        self._away.fill_(1 - min(self._decay, (step + 1) / (10 + step)))
 
     def learn(self, loss: torch.Tensor) -> None:
         """Take a step."""
         self._optimizer.zero_grad()
         loss.backward()
-        nn.utils.clip_grad_norm_(self.net.parameters(), 5.0)
+        nn.utils.clip_grad_norm_(self._weights, 5.0)
         self._optimizer.step()
-        self._schedule.step()
-        self._average()
-
-    def _average(self) -> None:
-        """Move the running mean towards the current weights, faster at the start."""
-        taken = self._schedule.last_epoch
-        keep = min(self._decay, taken / (9 + taken))
-        pairs = zip(self.slow.state_dict().values(), self.net.state_dict().values(), strict=True)
+        slow, fast = (list(each) for each in zip(*self._pairs, strict=True))
         with torch.no_grad():
-            for a, b in pairs:
-                if a.is_floating_point():
-                    a.lerp_(b, 1 - keep)
-                else:
-                    a.copy_(b)
+            ways = torch._foreach_sub(fast, slow)
+            torch._foreach_mul_(ways, self._away)
+            torch._foreach_add_(slow, ways)
 
 
 def train(learner: Learner, batches: Iterable[Batch], steps: int, out: Path) -> None:
     """Train a network and write the running mean of its weights, every hundred steps."""
     began, total = time.monotonic(), 0.0
     for step, (image, target, weight) in enumerate(islice(batches, steps)):
+        learner.prepare(step, steps)
         output = learner.net(image.to(memory_format=torch.channels_last))
         loss = loss_of(output, target, weight)
         learner.learn(loss)
@@ -131,7 +137,7 @@ def main() -> None:
         net.load_state_dict(torch.load(arguments.start))
     crops = Crops(frames, arguments.seed, float(arguments.stained), False, BATCH)
     batches = DataLoader(crops, batch_size=None, num_workers=1)  # cut by a process of its own
-    learner = Learner(net, arguments.steps, arguments.rate)
+    learner = Learner(net, arguments.rate)
     train(learner, batches, arguments.steps, arguments.out)
 
 
