@@ -61,12 +61,12 @@ verifier: $(STAMP)-dev system-libraries
 	$(BIN)/python -m training.verifier
 	$(BIN)/python -m training.fitted
 
-# Networks of `cap-net`. `train-taught` makes three seeds of the one that ships, taught by a large one:
-# eleven minutes of training on a GPU that PyTorch knows, beside 15 cores that cut crops. `train` makes one from nothing
-# on two cores within an hour: frames, network, figures; `train-seeds` adds two that tell how much
-# chance there is. There a training takes one core, and half of another to cut its crops; meanwhile
-# the one that ships is judged, which renders the frames for it. PyTorch for the CPU comes from
-# PyTorch's own index; elsewhere `torch` would bring CUDA along.
+# Networks of `cap-net`. `train-taught` makes the one that ships: three seeds taught by a large one,
+# eleven minutes of training on a GPU that PyTorch knows, beside 15 cores that cut crops, and joined
+# into one. `train` makes one from nothing on two cores within an hour: frames, network, figures;
+# `train-seeds` adds two that tell how much chance there is. There a training takes one core, and half
+# of another to cut its crops; meanwhile the one that ships is judged, which renders the frames for
+# it. PyTorch for the CPU comes from PyTorch's own index; elsewhere `torch` would bring CUDA along.
 NET := out/net
 CORES := $(shell nproc)
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
@@ -88,9 +88,11 @@ train-taught: $(STAMP) system-libraries
 	$(BIN)/pip install --quiet --editable '.[train]'
 	$(call render,2000)
 	$(BIN)/python -m training.net.taught --out $(NET)
-	for seed in 0 1 2; do $(BIN)/python -m training.net.export --weights $(NET)/taught-$$seed.pt \
-	  --out $(NET)/taught-$$seed.onnx || exit 1; done
-	$(BIN)/python -m training.net.judge --models $(NET)/taught-0.onnx $(NET)/taught-1.onnx $(NET)/taught-2.onnx
+	$(BIN)/python -m training.net.joined --weights $(NET)/taught-1.pt $(NET)/taught-0.pt $(NET)/taught-2.pt
+	for name in taught-0 taught-1 taught-2 joined; do $(BIN)/python -m training.net.export \
+	  --weights $(NET)/$$name.pt --out $(NET)/$$name.onnx || exit 1; done
+	$(BIN)/python -m training.net.judge --peers \
+	  --models $(NET)/taught-0.onnx $(NET)/taught-1.onnx $(NET)/taught-2.onnx $(NET)/joined.onnx
 
 $(NET)/seed-%.onnx:
 	$(BIN)/python -m training.net.train --seed $* --out $(NET)/seed-$*.pt

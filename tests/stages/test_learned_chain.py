@@ -82,14 +82,14 @@ def test_small_caps_are_seen_at_the_scale_of_large_ones_too() -> None:
 def test_one_cap_among_clutter_is_found_without_depth_and_hardly_a_cup_with_it() -> None:
     net = CapNet(radius_px=(8, None), min_score=0.05)
     detect, score = PhaseHough(radius_px=(8, None), use_learned=True), Score()
-    for seed in range(81, 87):
+    for seed in range(81, 93):
         bare = {"scene": "lab", "count": 1, "clutter": 12}
         frame = simulated(seed, width=640, height=480, shape_family="b", **bare)
         truth = frame.attached[TRUTH_TOPIC]
         frame = replace(frame, depth=None)
         score.add(detect.process(frame, *net.process(frame)), truth, counted(truth, *RADII))
-    assert score.right >= 4
-    assert score.false <= 2  # 13 where the classic features may outvote the network
+    assert score.right >= 8
+    assert score.false <= 4  # 11 where the classic features may outvote the network
 
 
 @pytest.mark.parametrize("learned", [False, True])
