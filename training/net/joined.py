@@ -26,7 +26,8 @@ def network(path: Path) -> CapNet:
     """Return the network of a file of weights."""
     net = CapNet()
     net.load_state_dict(torch.load(path))
-    return net.to(memory_format=torch.channels_last)
+    net.to(memory_format=torch.channels_last)  # in place
+    return net
 
 
 def main() -> None:
