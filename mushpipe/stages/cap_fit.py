@@ -22,6 +22,7 @@ from mushpipe.stages.cap_attempt import Frame, Settings
 from mushpipe.stages.cap_batch import Fits, fit_caps
 from mushpipe.stages.cap_blocks import Image, Sensor
 from mushpipe.stages.cap_clod import CLOD_CHANCE, clods
+from mushpipe.stages.cap_decode import first_of_each
 from mushpipe.stages.cap_gap import EdgeWatch
 from mushpipe.stages.cap_kin import FEWEST, kin_of, unlike
 from mushpipe.stages.cap_model import ASPECT, ASPECT_SIGMA
@@ -34,6 +35,7 @@ from mushpipe.stages.upright import Up, pixel_rays, upright
 from mushpipe.stages.warm_up import example_circles, example_frame
 
 LEAST = 8  # points that a surface over a hole needs
+_SAME = 0.6  # IoU of two circles that are one cap
 
 
 class CapFit(Stage):
@@ -126,7 +128,10 @@ class CapFit(Stage):
     ) -> tuple[Locations, Poses, Circles]:
         if self.min_score is None:
             return locations, poses, circles
-        rows = np.flatnonzero(circles.score >= self.min_score)
+        order = np.argsort(-circles.score, kind="stable")
+        likely = order[circles.score[order] >= self.min_score]
+        # A part of a cap that a detector doubted may have become the cap.
+        rows = np.sort(likely[first_of_each(discs_of(circles.take(likely)), _SAME)])
         return locations.take(rows), poses.take(rows), circles.take(rows)
 
     def fit(

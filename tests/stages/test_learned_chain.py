@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from mushpipe import RgbdFrame
+from mushpipe import Circles, RgbdFrame
 from mushpipe.core.truth import INSTANCES_TOPIC, TRUTH_TOPIC
+from mushpipe.evaluate.matching import circle_iou
 from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.cap_net import CapNet
 from mushpipe.stages.phase_hough import PhaseHough
@@ -109,6 +110,17 @@ def test_what_is_hardly_a_cap_changes_nothing_about_those_that_are_likely(learne
             assert np.array_equal(getattr(same, column), getattr(likely, column))
         below += len(found) - len(same)
     assert below > 0
+
+
+def test_a_part_of_a_cap_that_becomes_the_cap_is_no_second_one() -> None:
+    frame, fit = first("first-bed"), CapFit(min_score=0.5)
+    circles = PhaseHough(radius_px=RADII, use_learned=True).process(frame, *CapNet().process(frame))
+    parts = Circles(circles.center, 0.8 * circles.radius, 0.9 * circles.score)
+    found = fit.process(frame, circles.joined(parts))[-1]
+    assert len(found) > 0.9 * len(fit.process(frame, circles)[-1])
+    iou = circle_iou(found.center, found.radius, found.center, found.radius)
+    np.fill_diagonal(iou, 0)
+    assert iou.max() <= 0.6
 
 
 def test_grainy_caps_are_found_without_depth() -> None:
