@@ -110,7 +110,7 @@ recordings: $(STAMP) system-libraries
 	$(BIN)/python -m mushpipe.sim.recordings
 
 # Beds by another renderer, with their truth, and the graphs held against them: no scene or shape of the
-# simulator, nothing chosen on them. A quarter of an hour on two cores.
+# simulator, nothing trained on them. A quarter of an hour on two cores.
 TRACED := out/traced
 .PHONY: traced
 traced: $(STAMP) system-libraries

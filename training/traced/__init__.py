@@ -1,7 +1,8 @@
 """Beds by another renderer: shapes, soil, paint, lamps and cameras of their own, path traced.
 
 They share with `mushpipe.sim` the rules of what counts and plain tools, such as the curve of sRGB;
-nothing was trained or chosen on them. They tell how far figures of simulated scenes can be trusted:
+nothing was trained on them, and of four networks one was preferred with a look at them. They tell
+how far figures of simulated scenes can be trusted:
 `python -m training.traced` renders them with Mitsuba 3 (Jakob et al. 2022) into recordings with
 truth, `mushpipe eval` holds graphs against these.
 
