@@ -15,11 +15,10 @@ from mushpipe import Circles
 from mushpipe.core.arrays import Bools, Bytes, Floats, locked
 from mushpipe.core.jit import borrower
 from mushpipe.stages.cap_kin import DARK, UNIT, Kin, distances, write_tone
-from mushpipe.stages.discs import discs_of
+from mushpipe.stages.discs import LIKELY, discs_of
 
 ODD = 1.5  # distance to the nearer half of the sure caps from which on it is none of them
 ALIKE = 1.0  # distance to the ground up to which it looks like it
-LIKELY = 0.5  # score from which on a circle may be a cap, and so is no ground
 # The ground is looked at from 1.3 to 1.9 radii, so far from all circles that shadows end.
 _TURNS, _REACH = 2 * np.pi * (np.arange(32) + 0.5) / 32, np.linspace(1.3, 1.9, 6)
 RING = np.stack([np.outer(_REACH, np.cos(_TURNS)), np.outer(_REACH, np.sin(_TURNS))], -1)
