@@ -128,9 +128,9 @@ class CapFit(Stage):
     ) -> tuple[Locations, Poses, Circles]:
         if self.min_score is None:
             return locations, poses, circles
-        order = np.argsort(-circles.score, kind="stable")
+        order = np.lexsort((-circles.score, np.isnan(locations.position[:, 2])))
         likely = order[circles.score[order] >= self.min_score]
-        # A part of a cap that a detector doubted may have become the cap.
+        # A part of a cap that was doubted may have become the cap; what has a position stays.
         rows = np.sort(likely[first_of_each(discs_of(circles.take(likely)), _SAME)])
         return locations.take(rows), poses.take(rows), circles.take(rows)
 
