@@ -25,6 +25,7 @@ from mushpipe.core.overwriting import opened_alone
 from mushpipe.core.recorder import RecordingError
 from mushpipe.core.transform import Transform, base_of
 from mushpipe.sinks.rerun_memory import Remembering
+from mushpipe.sinks.rerun_pace import Pace
 
 logger = logging.getLogger("mushpipe")
 PORT = 9876  # the SDK's own default
@@ -62,6 +63,12 @@ class RerunSink(Sink):
     image_hz: float | None = Field(
         None, gt=0, description="most images per second; not set: 5 of a live run, all of a replay"
     )
+    result_hz: float | None = Field(
+        None,
+        gt=0,
+        description="most results per second; not set: all. As many as images, and each frame "
+        "that is shown is shown whole",
+    )
     jpeg_quality: int = Field(85, ge=1, le=100, description="quality of the stored colour images")
     index: bool = Field(
         True,
@@ -75,8 +82,7 @@ class RerunSink(Sink):
     _held: FileIO | None = PrivateAttr(None)
     _server: subprocess.Popen[bytes] | None = PrivateAttr(None)
     _notes: _Notes | None = PrivateAttr(None)
-    _period_ns: int = PrivateAttr(0)
-    _next_ns: int = PrivateAttr(0)
+    _paces: tuple[Pace, Pace] = PrivateAttr((Pace(None), Pace(None)))  # of images, of results
     _shown: tuple[list[str], float | None, list[str]] | None = PrivateAttr(None)
     _memories: tuple[Remembering, Remembering] | None = PrivateAttr(None)  # images, results
     _last: Header | None = PrivateAttr(None)
@@ -124,7 +130,7 @@ class RerunSink(Sink):
         self._base = base_of(graph)
         log_start(self._recording, workspace_of(graph), self._base)
         image_hz = self.image_hz or (LIVE_IMAGE_HZ if run.live else None)
-        self._period_ns = round(1e9 / image_hz) if image_hz else 0
+        self._paces = Pace(image_hz), Pace(self.result_hz)
         self._notes = _Notes()
         logger.addHandler(self._notes)
 
@@ -174,14 +180,14 @@ class RerunSink(Sink):
         rec, header, (images, results) = self._recording, trace.frame.header, self._memories
         rerun_log.set_frame(rec, header)
         self._last = header
-        stages = self._lay_out(trace)
-        since_ns = header.stamp_ns - self._next_ns + self._period_ns
-        if not 0 <= since_ns < self._period_ns:  # also after a leap, forwards or back
-            self._next_ns = header.stamp_ns + self._period_ns
+        image, result = (pace.due(header.stamp_ns) for pace in self._paces)
+        stages = self._lay_out(trace) if image or result else []
+        if image:
             rerun_log.log_images(images, trace, self.jpeg_quality, self.cloud_step)
             images.settle()
-        rerun_log.log_results(results, trace, self._base, stages)
-        results.settle()
+        if result:
+            rerun_log.log_results(results, trace, self._base, stages)
+            results.settle()
         self._write_notes(rr)
 
     def _lay_out(self, trace: Trace) -> list[str]:

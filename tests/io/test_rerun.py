@@ -300,6 +300,15 @@ def test_few_images_and_all_results(tmp_path: Path, settings: dict[str, Any]) ->
     assert len(values(found, f"{IMAGE}/picks", "centers")) == 31
 
 
+def test_frames_are_shown_whole_where_images_and_results_have_one_pace(tmp_path: Path) -> None:
+    traces = [trace_of(make_frame(i), pick=make_picks()) for i in range(31)]  # one second
+    found = show(tmp_path, traces, image_hz=5, result_hz=5)
+    shown = found[f"{IMAGE}/color"]["frame"]
+    assert 4 <= len(shown) <= 6
+    assert found[f"{IMAGE}/picks"]["frame"] == found["/log"]["frame"] == shown
+    assert len(values(found, f"{IMAGE}/picks", "centers")) == len(shown)
+
+
 def test_images_go_on_after_a_stamp_that_leaps(tmp_path: Path) -> None:
     shifts = [0, 0, 0, 100, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]  # s
     traces = []
