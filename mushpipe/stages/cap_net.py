@@ -35,6 +35,7 @@ _LARGEST_SCALE = 4.0
 _LEAST_KNOWN = 0.35  # share of the pixels with depth from which on depth tells enough
 # Depth shrinks the image in such steps: every size of it has a session of its own.
 _STEP, _LEAST_SCALE = 0.8, 0.2
+_SMALLEST = 400  # px; down to this longer side an image is looked at, at whatever scale that is
 # px; where few caps were seen, an image less wide than the training's is asked for larger radii
 # alone: nothing tells then what caps look like here, and cups look like caps in small images.
 _WIDTH, _LARGE = 640, 45.0
@@ -56,7 +57,7 @@ class CapNet(Stage):
         (8, 45),
         description="smallest and largest radius, px; circles may be a tenth beyond; the image is "
         "scaled to suit. [8, null]: what largest_mm is at the depth that is seen, 60 px or more; "
-        "without depth the scale is halved while circles explain more of the image so",
+        "without depth it is looked at smaller, too, where circles explain more of it so",
     )
     largest_mm: float = Field(
         90, ge=1, description="largest diameter, mm, where radius_px leaves it to depth"
@@ -118,14 +119,16 @@ class CapNet(Stage):
         """
         scale, largest = self.scaling(frame)
         mask, found = self._look(frame.color, scale, largest or _KNOWN[1])
-        further = largest is None
-        while further and scale / 2 >= _LEAST_SCALE:
+        if largest is not None:
+            return mask, found
+        side = max(frame.color.shape)
+        while scale / 2 >= min(_LEAST_SCALE, _SMALLEST / side):
             # Nothing tells how large caps are, but that more is explained at the scale they are of.
             scale /= 2
             seen, coarse = self._look(frame.color, scale, _KNOWN[1] / scale)
-            if max(frame.color.shape) * scale < _WIDTH and not many_likely(found):
+            if side * scale < _WIDTH and not many_likely(found):
                 coarse = coarse.take(coarse.radius >= _LARGE / (2 * scale))
-            if further := _explained(coarse) > _CLEARLY * _explained(found):
+            if _explained(coarse) > _CLEARLY * _explained(found):
                 mask = Mask(mask.foreground | seen.foreground)
                 found = self._together(found, coarse)
         return mask, found

@@ -80,6 +80,22 @@ def test_small_caps_are_seen_at_the_scale_of_large_ones_too() -> None:
         assert near.mean() > 0.85
 
 
+def test_caps_of_hundreds_of_pixels_are_found_in_an_image_of_millions() -> None:
+    seen = []
+    for seed in (91, 92, 93):
+        near = {"distance": 0.25, "size_mm": (45, 75), "count": 12, "shape_family": "b"}
+        frame = simulated(seed, width=640, height=480, **near)
+        large = cv2.resize(frame.color, None, fx=5, fy=5, interpolation=cv2.INTER_CUBIC)
+        _, found = CapNet(radius_px=(8, None)).process(RgbdFrame(frame.header, large))
+        truth = frame.attached[TRUTH_TOPIC]
+        caps = truth.take(counted(truth, 60, 200))  # 300 px and more in the enlarged image
+        away = np.linalg.norm(5 * caps.center[:, None] + 2 - found.center, axis=2)
+        ratio = found.radius[away.argmin(axis=1)] / (5 * caps.radius)
+        seen += [*((away.min(axis=1) < caps.radius) & (np.abs(ratio - 1) < 0.2))]
+    assert len(seen) >= 8
+    assert np.mean(seen) > 0.85
+
+
 def test_one_cap_among_clutter_is_found_without_depth_and_hardly_a_cup_with_it() -> None:
     net = CapNet(radius_px=(8, None), min_score=0.05)
     detect, score = PhaseHough(radius_px=(8, None), use_learned=True), Score()
