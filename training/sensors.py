@@ -13,14 +13,29 @@ from mushpipe.core.arrays import Singles
 
 
 def worse(frame: RgbdFrame, rng: np.random.Generator) -> RgbdFrame:
-    """Return a frame with coarser, shifted, noisier depth that lacks edges and patches."""
+    """Return a frame with mismatched, coarse, shifted, noisy depth that lacks edges and patches."""
     if frame.depth is None:
         return frame
     depth = frame.depth.astype(np.float32) * np.float32(frame.depth_scale)
-    for damage in (_coarser, _shifted, _noisier, _without_edges, _with_holes):
+    for damage in (_mismatched, _coarser, _shifted, _noisier, _without_edges, _with_holes):
         depth = damage(depth, rng)
     native = np.clip(np.rint(depth / frame.depth_scale), 0, 65535).astype(np.uint16)
     return replace(frame, depth=native)
+
+
+def _mismatched(depth: Singles, rng: np.random.Generator) -> Singles:
+    """Patches as far as what lies behind them, in a third of the frames.
+
+    So a stereo camera sees smooth caps in which it finds nothing to match.
+    """
+    if rng.random() > 1 / 3:
+        return depth
+    width = 2 * int(rng.integers(15, 45)) + 1
+    behind = cv2.GaussianBlur(cv2.dilate(depth, np.ones((width, width), np.uint8)), (0, 0), 4)
+    cloud = _blurred((depth.shape[0], depth.shape[1]), rng.uniform(8, 25), rng)
+    beyond = cloud - np.float32(rng.uniform(1, 2))
+    lost = (depth == 0) | (np.abs(beyond) < 0.1)
+    return np.where(lost, np.float32(0), np.where(beyond > 0, behind, depth))
 
 
 def _coarser(depth: Singles, rng: np.random.Generator) -> Singles:

@@ -74,6 +74,16 @@ def test_a_worse_camera_sees_less_and_noisier_depth_where_there_was_some() -> No
         assert 0 < np.nanmedian(off) < 0.005
 
 
+def test_in_some_frames_of_a_worse_camera_caps_are_in_part_as_far_as_the_bed() -> None:
+    frame = simulated(6, width=640, height=480)
+    cap = cap_mask(frame.attached[TRUTH_TOPIC], frame.attached[INSTANCES_TOPIC])
+    bed, rng = np.nanmedian(frame.depth_m[~cap]), np.random.default_rng(0)
+    high = cap & (frame.depth_m < bed - 0.02)
+    shares = [(worse(frame, rng).depth_m[high] > bed - 0.005).mean() for _ in range(12)]
+    assert 2 <= sum(share > 0.02 for share in shares) <= 8
+    assert sum(share < 0.002 for share in shares) >= 4
+
+
 def test_a_harder_frame_has_blotches_on_its_caps_and_at_times_on_its_bed_and_worse_depth() -> None:
     frame = simulated(6, width=320, height=240)
     truth, rng = frame.attached[TRUTH_TOPIC], np.random.default_rng(0)
