@@ -10,11 +10,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from mushpipe.core.truth import INSTANCES_TOPIC
+from mushpipe.core.truth import INSTANCES_TOPIC, Ignore
 from training.net.augment import blotched
 from training.net.scenes import cap_mask
 from training.scenes import Case
 from training.sensors import worse
+
+SUNK = 0.008  # m; so much too far away a pixel does not show its cap
+LOST = 0.3  # share of such pixels from which on a cap is not to be told by its depth
 
 
 def stained(case: Case, rng: np.random.Generator) -> Case:
@@ -29,6 +32,17 @@ def stained(case: Case, rng: np.random.Generator) -> Case:
 
 
 def harder(case: Case, rng: np.random.Generator) -> Case:
-    """Return a case that is `stained`, in worse depth."""
+    """Return a case that is `stained`, in worse depth.
+
+    What depth puts on the bed for the most part no longer counts: that flat things are caps is not
+    to be learned.
+    """
     case = stained(case, rng)
-    return replace(case, frame=worse(case.frame, rng))
+    frame = worse(case.frame, rng)
+    labels = frame.attached[INSTANCES_TOPIC].labels
+    rows = len(case.truth) + 1
+    sunk = np.bincount(labels[frame.depth_m > case.frame.depth_m + SUNK], minlength=rows)
+    share = sunk[1:] / np.maximum(np.bincount(labels.ravel(), minlength=rows)[1:], 1)
+    lost = (share > LOST) & (case.truth.ignore == Ignore.COUNTS)
+    ignore = np.where(lost, Ignore.AMBIGUOUS, case.truth.ignore).astype(np.uint8)
+    return replace(case, frame=frame, truth=replace(case.truth, ignore=ignore))
