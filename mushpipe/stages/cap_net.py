@@ -57,7 +57,7 @@ class CapNet(Stage):
         (8, 45),
         description="smallest and largest radius, px; circles may be a tenth beyond; the image is "
         "scaled to suit. [8, null]: what largest_mm is at the depth that is seen, 60 px or more; "
-        "without depth it is looked at smaller, too, where circles explain more of it so",
+        "without depth smaller scales are looked at, and what is seen there better stays",
     )
     largest_mm: float = Field(
         90, ge=1, description="largest diameter, mm, where radius_px leaves it to depth"
