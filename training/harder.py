@@ -34,8 +34,8 @@ def stained(case: Case, rng: np.random.Generator) -> Case:
 def harder(case: Case, rng: np.random.Generator) -> Case:
     """Return a case that is `stained`, in worse depth.
 
-    What depth puts on the bed for the most part no longer counts: that flat things are caps is not
-    to be learned.
+    A cap that depth puts on the bed by more than `LOST` no longer counts: that flat things are caps
+    is not to be learned.
     """
     case = stained(case, rng)
     frame = worse(case.frame, rng)
