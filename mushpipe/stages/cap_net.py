@@ -35,7 +35,7 @@ _LARGEST_SCALE = 4.0
 _LEAST_KNOWN = 0.35  # share of the pixels with depth from which on depth tells enough
 # Depth shrinks the image in such steps: every size of it has a session of its own.
 _STEP, _LEAST_SCALE = 0.8, 0.2
-_SMALLEST = 400  # px; down to this longer side an image is looked at, at whatever scale that is
+_SMALLEST = 400  # px; down to this longer side an image is looked at, whatever was seen before
 # px; where few caps were seen, an image less wide than the training's is asked for larger radii
 # alone: nothing tells then what caps look like here, and cups look like caps in small images.
 _WIDTH, _LARGE = 640, 45.0
@@ -121,14 +121,14 @@ class CapNet(Stage):
         mask, found = self._look(frame.color, scale, largest or _KNOWN[1])
         if largest is not None:
             return mask, found
-        side = max(frame.color.shape)
-        while scale / 2 >= min(_LEAST_SCALE, _SMALLEST / side):
+        side, further = max(frame.color.shape), True
+        while (further and scale / 2 >= _LEAST_SCALE) or side * scale / 2 >= _SMALLEST:
             # Nothing tells how large caps are, but that more is explained at the scale they are of.
             scale /= 2
             seen, coarse = self._look(frame.color, scale, _KNOWN[1] / scale)
             if side * scale < _WIDTH and not many_likely(found):
                 coarse = coarse.take(coarse.radius >= _LARGE / (2 * scale))
-            if _explained(coarse) > _CLEARLY * _explained(found):
+            if further := _explained(coarse) > _CLEARLY * _explained(found):
                 mask = Mask(mask.foreground | seen.foreground)
                 found = self._together(found, coarse)
         return mask, found
