@@ -45,6 +45,8 @@ CONDITIONS: dict[str, dict[str, Any]] = {
     },
     "low": {"sunk": 1, "relief_mm": 4, "rubble": 40},
     "lids": {"lids": 15, "relief_mm": 2, "count": 60},
+    "few": {"scene": "lab", "count": 3, "clutter": 6},
+    "picked": {"count": 5, "stumps": 10, "rubble": 20, "pins": 10},
 }
 
 # How many frames of each condition a training run takes, seeds from 0 on.
@@ -56,6 +58,8 @@ TRAINING = {
 }  # fmt: skip
 # How many more of them, for what can learn from rare scenes without forgetting the usual ones.
 MORE = {"near": 2, "lab": 4, "cloth": 2, "paint": 2, "bare": 7, "wood": 2, "lids": 2}
+# How many frames with few caps, of which other things are as many, seeds from `FEW_SEED` on.
+FEW = {"bare": 24, "lab": 8, "cloth": 6, "paint": 6, "wood": 8, "few": 16, "picked": 20}
 CHOOSING = {
     "even": 3, "gradient": 3, "dense": 3, "brown": 3, "tilted": 4, "harsh": 2, "near": 1,
     "oblique": 1, "lab": 2, "empty": 1, "bare": 1, "fallen": 2, "wood": 2,
@@ -63,7 +67,7 @@ CHOOSING = {
 }  # fmt: skip
 JUDGED = ("even", "gradient", "dense", "brown", "tilted", "side", "harsh", "lab", "empty", "bare",
           "fallen", "wood", "low", "lids")  # fmt: skip
-CHOOSING_SEED, JUDGING_SEED = 900, 5000
+CHOOSING_SEED, FEW_SEED, JUDGING_SEED = 900, 2000, 5000
 
 
 @dataclass(frozen=True)
@@ -119,6 +123,13 @@ def more_cases(cache: Path) -> Iterator[Case]:
     for number, (condition, count) in enumerate(TRAINING.items()):
         for k in range(count, count + MORE.get(condition, 0)):
             yield render(condition, "a", 20 * number + k, cache)
+
+
+def few_cases(cache: Path) -> Iterator[Case]:
+    """Yield frames for training in which few caps are seen, as `FEW` says."""
+    for number, (condition, count) in enumerate(FEW.items()):
+        for k in range(count):
+            yield render(condition, "a", FEW_SEED + 50 * number + k, cache)
 
 
 def choosing_cases(cache: Path) -> Iterator[Case]:

@@ -26,7 +26,12 @@ FLAT_CHANCE = 0.01  # of 127 that flat in the training scenes none was a cap
 FIT = ("misfit", "tilt", "aspect", "moved", "resized", "lean")
 NAMES = ("score", *FIT, "unlike")
 # What is known decides which model is asked; each is over some of these features.
-MODELS = {"fitted": NAMES[:-1], "fitted_kin": NAMES, "seen_kin": ("score", "unlike")}
+MODELS = {
+    "fitted": NAMES[:-1],
+    "fitted_kin": NAMES,
+    "fitted_few": NAMES[:-1],  # where few circles are surely caps
+    "seen_kin": ("score", "unlike"),
+}
 
 
 def features(circles: Circles, unlike: Floats, fits: Fits | None = None) -> Floats:
@@ -69,7 +74,8 @@ def chances(circles: Circles, unlike: Floats, fits: Fits | None = None) -> Float
 
     It is what the fit tells, or the score where nothing was fitted; less where the circle looks
     unlike the sure caps. That it looks like them is no reason to believe in it: stems do, too.
-    What was fitted as flat has `FLAT_CHANCE` at most.
+    Where few are sure, other things than caps are more of what is seen, and a model of its own
+    decides. What was fitted as flat has `FLAT_CHANCE` at most.
 
     Args:
         circles: As detected, with the scores of `phase-hough`.
@@ -80,7 +86,8 @@ def chances(circles: Circles, unlike: Floats, fits: Fits | None = None) -> Float
     model = {name: probability(table, weights) for name, weights in _models().items()}
     chance, beside = circles.score, model["seen_kin"]
     if fits is not None:
-        chance = np.where(fits.valid, model["fitted"], chance)
+        fitted = np.where(np.isfinite(unlike), model["fitted"], model["fitted_few"])
+        chance = np.where(fits.valid, fitted, chance)
         chance = np.where(flat(fits), np.minimum(chance, FLAT_CHANCE), chance)
         beside = np.where(fits.valid, model["fitted_kin"], beside)
     return np.where(np.isfinite(unlike), np.minimum(chance, beside), chance)

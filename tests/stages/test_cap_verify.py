@@ -7,8 +7,8 @@ import pytest
 
 from mushpipe import Circles, DepthSource, RgbdFrame
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_verify import FLAT_CHANCE, NAMES, chances, features
-from mushpipe.stages.verifier import LIMIT, probability
+from mushpipe.stages.cap_verify import FILE, FLAT_CHANCE, NAMES, chances, features
+from mushpipe.stages.verifier import LIMIT, package_file, probability, read_models
 from tests.stages.caps import CAMERA, cap, circles_of, draw, frame_from
 
 BED = 0.44
@@ -109,8 +109,10 @@ def test_what_looks_unlike_the_sure_caps_is_less_likely_one_and_likeness_is_no_r
     depth[:, :200] = np.nan
     frame = frame_from(depth, gray)
     fits = CapFit(up="camera").fit(frame.gray, frame.depth_m, CAMERA, circles)
-    for some in (fits, None):
-        alone = chances(circles, UNKNOWN, some)
+    models = read_models(package_file(FILE), ["fitted"], NAMES)
+    fitted = probability(np.nan_to_num(features(circles, UNKNOWN, fits)), models["fitted"])
+    fitted = np.where(fits.valid, fitted, circles.score)
+    for some, alone in ((fits, fitted), (None, circles.score)):
         beside = [chances(circles, np.full(6, far), some) for far in np.linspace(0, 6, 13)]
         assert (beside <= alone).all()
         assert (np.diff(beside, axis=0) <= 0).all()

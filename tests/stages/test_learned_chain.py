@@ -19,6 +19,7 @@ from training.matching import Score, counted
 from training.net.scenes import cap_mask
 
 RADII = (8.0, 45.0)
+BARE = {"scene": "lab", "count": 1, "clutter": 12}
 
 
 def test_more_brown_caps_among_rubble_are_found_than_by_the_net_alone_and_refitted() -> None:
@@ -100,13 +101,25 @@ def test_one_cap_among_clutter_is_found_without_depth_and_hardly_a_cup_with_it()
     net = CapNet(radius_px=(8, None), min_score=0.05)
     detect, score = PhaseHough(radius_px=(8, None), use_learned=True), Score()
     for seed in range(81, 93):
-        bare = {"scene": "lab", "count": 1, "clutter": 12}
-        frame = simulated(seed, width=640, height=480, shape_family="b", **bare)
+        frame = simulated(seed, width=640, height=480, shape_family="b", **BARE)
         truth = frame.attached[TRUTH_TOPIC]
         frame = replace(frame, depth=None)
         score.add(detect.process(frame, *net.process(frame)), truth, counted(truth, *RADII))
     assert score.right >= 8
     assert score.false <= 4  # 11 where the classic features may outvote the network
+
+
+def test_one_cap_among_clutter_is_found_with_depth_and_hardly_a_cup_is_fitted() -> None:
+    net = CapNet(radius_px=(8, None), min_score=0.05, beside_depth=0.8)
+    detect = PhaseHough(radius_px=(8, None), min_score=0.2, use_learned=True)
+    fit, score = CapFit(min_score=0.5), Score()
+    for seed in range(81, 93):
+        frame = simulated(seed, width=640, height=480, shape_family="b", **BARE)
+        circles = fit.process(frame, detect.process(frame, *net.process(frame)))[-1]
+        truth = frame.attached[TRUTH_TOPIC]
+        score.add(circles, truth, counted(truth, *RADII))
+    assert score.right >= 10
+    assert score.false <= 3  # 7 where one model decides about beds and tables
 
 
 @pytest.mark.parametrize("learned", [False, True])

@@ -37,15 +37,15 @@ def test_a_doubtful_network_finds_fewer_circles_with_lower_scores_and_no_others(
 def test_a_circle_teaches_the_models_that_would_be_asked_about_it() -> None:
     known = {  # fit, likeness -> models
         (True, True): ["fitted", "fitted_kin"],
-        (True, False): ["fitted"],
+        (True, False): ["fitted", "fitted_few"],
         (False, True): ["seen_kin"],
         (False, False): [],
     }
     rows = np.zeros((len(known), len(NAMES)))
     for row, (fitted, alike) in zip(rows, known, strict=True):
         row[1:-1], row[-1] = 0.0 if fitted else np.nan, 0.0 if alike else np.nan
-    for model, names in MODELS.items():
-        assert teaches(rows, names).tolist() == [model in models for models in known.values()]
+    for model in MODELS:
+        assert teaches(rows, model).tolist() == [model in models for models in known.values()]
 
 
 def test_a_cap_teaches_one_circle_and_what_need_not_be_found_teaches_none() -> None:
@@ -61,6 +61,29 @@ def test_a_cap_teaches_one_circle_and_what_need_not_be_found_teaches_none() -> N
     assert found[:3].tolist() == [1, 0, 1]
     assert np.isnan(found[3])
     assert found[4] == 0
+
+
+def test_cut_stumps_are_no_caps_where_they_teach_at_all() -> None:
+    truth = simulated(5, width=640, height=480, count=10, stumps=12).attached[TRUTH_TOPIC]
+    stumps = truth.ignore == Ignore.CUT_STUMP
+    circles = Circles(truth.center, truth.radius, np.ones(len(truth)))
+    assert stumps.sum() > 3
+    assert np.isnan(labels(circles, truth)[stumps]).all()
+    taught = labels(circles, truth, stumps=True)
+    assert (taught[stumps] == 0).sum() > 3  # but for those on what does not count
+    assert np.array_equal(taught[~stumps], labels(circles, truth)[~stumps], equal_nan=True)
+
+
+def test_with_a_share_the_probabilities_are_those_of_scenes_that_have_it() -> None:
+    rng = np.random.default_rng(0)
+    right = (np.arange(20_000) % 2).astype(float)
+    x = rng.normal(right[:, None], 1)  # log odds of an even share: x - 1/2
+    model = fit(x, right, ("one",), 1e-6, LIMIT, (), share=0.8)
+    one = model["features"]["one"]
+    slope = one["weight"] / one["scale"]
+    assert slope == pytest.approx(1, abs=0.05)
+    at_half = model["intercept"] + slope * (0.5 - one["mean"])
+    assert at_half == pytest.approx(np.log(4), abs=0.05)
 
 
 def test_a_worse_camera_sees_less_and_noisier_depth_where_there_was_some() -> None:
