@@ -1,11 +1,13 @@
 """One client's socket: limits, deadlines, and one line on its way out, never a queue.
 
-The next line, asked for or not, is made only when the last one has been handed to the kernel
-whole. So a slow client is sent fewer and newer lines, and holds no memory.
+The next line is made only when the last one has been handed to the kernel whole, and one that was
+not asked for only when the kernel would send it on at once. So a slow client is sent fewer and newer
+lines, and holds no memory.
 """
 
 from __future__ import annotations
 
+import select
 import socket
 import ssl
 import struct
@@ -63,6 +65,7 @@ class Connection:
         self._scanned = 0
         self._out = memoryview(b"")
         self._expires: float | None = None
+        self._full = False
         self._tls_wants_input = False
         self._eof = False
         self._draining: float | None = None
@@ -81,8 +84,8 @@ class Connection:
 
     @property
     def wants_output(self) -> bool:
-        """Whether a line is on its way that the kernel did not take."""
-        return bool(self._out) and not self._tls_wants_input
+        """Whether a line is on its way that the kernel did not take, or that it would not take."""
+        return (bool(self._out) or self._full) and not self._tls_wants_input
 
     @property
     def throttled(self) -> bool:
@@ -134,7 +137,7 @@ class Connection:
             if self.session.closing:
                 self._finish(now)
                 return
-            outgoing = self.session.due(now)
+            outgoing = self.session.due(now) if self._room(now) else None
             if outgoing is None:
                 line = self._take(now)
                 if line is None:
@@ -145,6 +148,14 @@ class Connection:
             if outgoing is not None:
                 self._send(outgoing, now)
         self.busy = True
+
+    def _room(self, now: float) -> bool:
+        """Return whether the kernel takes a line: in a queue behind others it would grow old."""
+        full = not select.select((), (self.sock,), (), 0)[1]
+        if full and not self._full:
+            self._progress = now
+        self._full = full
+        return not full
 
     def _send(self, outgoing: Outgoing, now: float) -> None:
         self._observe("tx", self.number, outgoing.data)
@@ -211,7 +222,7 @@ class Connection:
     def _check(self, now: float) -> None:
         """Cut off a client that is too slow in any way."""
         limits = self._limits
-        if self._out:
+        if self._out or self._full:
             if now - self._progress > limits.write_s:
                 self.abort("it does not read")
         elif self._eof:

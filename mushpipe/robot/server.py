@@ -160,8 +160,11 @@ class RobotServer:
         try:
             sock.setblocking(False)
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            # A deep buffer would hold old lines for a client that stopped reading.
+            # A deep buffer would hold old lines for a client that reads slowly: the kernel is to
+            # take no more than it can send on at once.
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+            if hasattr(socket, "TCP_NOTSENT_LOWAT"):  # on Linux and macOS
+                sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, 1)
             if self._options.tls is not None:
                 sock = self._options.tls.wrap_socket(
                     sock, server_side=True, do_handshake_on_connect=False

@@ -57,6 +57,20 @@ def test_a_slow_client_gets_fewer_and_newer_results() -> None:
         assert len(seqs) < 30
 
 
+def test_a_slow_client_finds_few_old_results_before_it_where_lines_are_short() -> None:
+    short = choice(2)
+    with bench() as b, Peer(b.port, receive_buffer=4096) as slow, Peer(b.port) as healthy:
+        slow.greet("stream")
+        healthy.greet("stream")
+        for _ in range(200):
+            b.publish(short)
+            healthy.skim()
+        seqs = [slow.skim()]
+        while seqs[-1] < 200:
+            seqs.append(slow.skim())
+        assert len(seqs) < 30  # all 200 where lines wait in the server's kernel
+
+
 def test_a_client_that_asks_and_never_reads_is_not_kept() -> None:
     with bench() as b, Peer(b.port, receive_buffer=4096) as dead, Peer(b.port) as healthy:
         b.publish(BIG)
