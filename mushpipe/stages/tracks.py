@@ -42,7 +42,8 @@ class Sightings(Columns):
 class Tracks:
     """Assigns mushrooms to those seen before: least total distance, each within half a radius.
 
-    Distances are taken in 3D, and in the image where a position is unknown. When the camera moves
+    Distances are taken in 3D, and in the image where a position is unknown; of two as far away the
+    one of about the same radius is nearer. When the camera moves
     all mushrooms shift alike; that shift is what most pairs of old and new agree on. Where few are
     found again, and those not where they were, all of them are new.
     """
@@ -81,7 +82,7 @@ class Tracks:
         )
         old, flat = _moved(self._known, new, image)
         deep = _deep(new, old)
-        rows, columns = _assign(np.where(np.isfinite(deep), deep, flat))
+        rows, columns = _assign(np.where(np.isfinite(deep), deep, flat), _resized(new, old))
         if _by_chance(flat[rows, columns], len(new)):
             rows = columns = rows[:0]
         ids = new.id.copy()
@@ -112,6 +113,11 @@ def _deep(new: Sightings, old: Sightings) -> Floats:
     return _steps(new.position, old.position) / _gates(new.size, old.size)
 
 
+def _resized(new: Sightings, old: Sightings) -> Floats:
+    """Return how much larger or smaller (N, M) each new one is in the image, in gates."""
+    return np.abs(new.radius[:, None] - old.radius[None]) / _gates(new.radius, old.radius)
+
+
 def _steps(new: Floats, old: Floats) -> Floats:
     return cdist(new, old) if len(new) and len(old) else np.zeros((len(new), len(old)))
 
@@ -120,12 +126,12 @@ def _gates(new: Floats, old: Floats) -> Floats:
     return GATE * np.minimum(new[:, None], old[None])
 
 
-def _assign(distances: Floats) -> tuple[Rows, Rows]:
+def _assign(distances: Floats, resized: Floats) -> tuple[Rows, Rows]:
     """Return the rows and columns of the pairs: as many as there can be, as near as can be."""
     # A pair outside its gate costs more than any number of pairs inside theirs.
-    cost = np.where(distances <= 1, distances, 1e6)
-    rows, columns = linear_sum_assignment(cost)
-    inside = cost[rows, columns] <= 1
+    near = distances <= 1
+    rows, columns = linear_sum_assignment(np.where(near, np.hypot(distances, resized), 1e6))
+    inside = near[rows, columns]
     return rows[inside], columns[inside]
 
 

@@ -14,14 +14,17 @@ from tests.stages.scenes import CAMERA
 IMAGE = (CAMERA.width, CAMERA.height)
 
 
-def seen(*rows: tuple[float, float, float], radius: float = 8.0) -> tuple[Circles, Locations]:
+def seen(
+    *rows: tuple[float, float, float], radius: float | tuple[float, ...] = 8.0
+) -> tuple[Circles, Locations]:
     """Mushrooms at u, v (px) and z (m); a z of NaN is missing."""
     u, v, z = np.reshape(rows, (len(rows), 3)).T
     center, n = np.stack([u, v], axis=1), len(u)
+    radius = np.broadcast_to(radius, n)
     position = CAMERA.deproject(center, z)
     missing = np.isnan(z)
     position[missing] = np.nan
-    return Circles(center, np.full(n, radius), np.ones(n)), Locations.unknown(
+    return Circles(center, radius, np.ones(n)), Locations.unknown(
         n,
         position=position,
         distance=np.linalg.norm(position, axis=1),
@@ -79,6 +82,14 @@ def test_a_nearer_mushroom_is_not_the_one_behind_it() -> None:
     assert ids(tracks, (50, 50, 0.50)) == [0]
     assert ids(tracks, (50, 50, 0.46), at=1) == [1]
     assert ids(tracks, (50, 50, np.nan), at=2) in ([0], [1])
+
+
+def test_one_without_depth_does_not_give_its_id_to_one_of_another_size() -> None:
+    tracks = Tracks()
+    both = seen((50, 50, np.nan), (56, 50, 0.5), radius=(12.0, 8.0))
+    assert tracks.update(*both, IMAGE, 0, 10).tolist() == [0, 1]
+    left = seen((52.8, 50, 0.5), radius=(8.5,))
+    assert tracks.update(*left, IMAGE, 1, 10).tolist() == [1]
 
 
 def test_an_id_survives_a_gap_within_the_memory_and_is_never_used_again() -> None:
