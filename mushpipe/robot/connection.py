@@ -1,8 +1,8 @@
 """One client's socket: limits, deadlines, and one line on its way out, never a queue.
 
 The next line is made only when the last one has been handed to the kernel whole, and one that was
-not asked for only when the kernel would send it on at once. So a slow client is sent fewer and newer
-lines, and holds no memory.
+not asked for only when the kernel would send it on at once. So a slow client is sent fewer and
+newer lines, and holds no memory.
 """
 
 from __future__ import annotations

@@ -17,9 +17,12 @@ from mushpipe.core.arrays import Floats, Singles
 
 logger = logging.getLogger("mushpipe")
 
-# Edges: enough to judge by, from so many frames at most, and how far from what was stated they may
-# lie, px. At two, diameters are 1.5 mm off, and axes by 2 degrees more.
-ENOUGH, PATIENCE, AMISS, SHIFTED = 100, 60, 1.5, 2.0
+# Edges: enough to judge by, and how far from what was stated they may lie, px. At two, diameters
+# are 1.5 mm off, and axes by 2 degrees more.
+ENOUGH, AMISS, SHIFTED = 100, 1.5, 2.0
+# After so many frames FEW are judged by, too, for a camera that stands still sees no others; they
+# may lie UNSURE further off. It is looked again each time so many frames have come.
+PATIENCE, FEW, UNSURE = 60, 12, 1.5
 _OUTLIER = 2.0  # px from what is usual
 # Least eigenvalue of the normal matrix; 0.5 where all sides are alike. A projector's shadow hides
 # depth beside each cap on one side: beds have 0.05 to 0.3, and tell shifts of 5 px to about 1 px.
@@ -38,6 +41,7 @@ class EdgeWatch:
     def __init__(self) -> None:
         self._gaps: list[Floats] | None = []  # None once they were judged
         self._seen = np.zeros((0, 2))  # centres of the circles that were looked at, px
+        self._frames = 0
 
     def look(self, frame: RgbdFrame, circles: Circles, edge_offset_px: float) -> None:
         """Look at a frame; warn, once, where depth shows caps otherwise than colour.
@@ -47,7 +51,9 @@ class EdgeWatch:
             circles: Outlines of caps.
             edge_offset_px: How much of an edge depth is said to lose, px.
         """
-        if self._gaps is None:
+        self._frames += 1
+        patient = self._frames % PATIENCE == 0
+        if self._gaps is None or (self._frames > PATIENCE and not patient):
             return
         # Where nothing moves, the same edges again would say nothing new.
         away = np.linalg.norm(circles.center[:, None] - self._seen, axis=2)
@@ -55,15 +61,19 @@ class EdgeWatch:
         self._seen = np.concatenate([self._seen, new.center])
         self._gaps.append(edge_gaps(frame, new))
         gaps = np.concatenate(self._gaps)
-        found = usual(gaps) if len(gaps) >= ENOUGH else None
-        if found is not None:
-            _tell(-found[0], edge_offset_px, (found[1], found[2]))
-        if found is not None or len(self._gaps) == PATIENCE:
+        enough = len(gaps) >= ENOUGH
+        found = usual(gaps) if enough or (patient and len(gaps) >= FEW) else None
+        if found is None:
+            return
+        amiss = _tell(-found[0], edge_offset_px, (found[1], found[2]), 0 if enough else UNSURE)
+        if enough or amiss:
             self._gaps = None
 
 
-def _tell(lost: float, stated: float, shift: tuple[float, float]) -> None:
-    if np.hypot(*shift) > SHIFTED:
+def _tell(lost: float, stated: float, shift: tuple[float, float], unsure: float) -> bool:
+    """Warn of what is amiss by more than `unsure` px beyond what may be; return if anything is."""
+    shifted, wider = np.hypot(*shift) > SHIFTED + unsure, abs(lost - stated) > AMISS + unsure
+    if shifted:
         logger.warning(
             "cap-fit: depth shows caps %.1f px to the %s and %.1f px %s of where colour shows "
             "them: it is not aligned to colour, and positions and axes are wrong; calibrate the "
@@ -71,7 +81,7 @@ def _tell(lost: float, stated: float, shift: tuple[float, float]) -> None:
             *(abs(shift[0]), "right" if shift[0] > 0 else "left"),
             *(abs(shift[1]), "below" if shift[1] > 0 else "above"),
         )
-    if abs(lost - stated) > AMISS:
+    if wider:
         logger.warning(
             "cap-fit: edges of caps in depth lie %.1f px %s of those in colour, where "
             "edge_offset_px: %g takes them for %.1f px %s; diameters are too %s: set "
@@ -82,6 +92,7 @@ def _tell(lost: float, stated: float, shift: tuple[float, float]) -> None:
             "large" if lost < stated else "small",
             np.clip(lost, -3, 3),
         )
+    return bool(shifted or wider)
 
 
 def usual(gaps: Floats) -> Floats | None:

@@ -132,6 +132,30 @@ def test_shadows_beside_all_caps_keep_nobody_from_telling(
     assert told == pytest.approx([right] * len(told), abs=1.3)
 
 
+@pytest.mark.parametrize("shift", [(0, 0), (5, 0), (0, 5), (0, -5)])
+def test_a_camera_that_stands_still_is_told_of_after_a_while_and_only_once(
+    shift: tuple[int, int], caplog: pytest.LogCaptureFixture
+) -> None:
+    for seed in (9000, 9001):
+        frame = simulated(seed, width=640, height=480, count=50)
+        truth = frame.attached[TRUTH_TOPIC].take(frame.attached[TRUTH_TOPIC].ignore == 0)
+        assert frame.depth is not None
+        seen = replace(frame, depth=np.roll(frame.depth, shift[::-1], axis=(0, 1)))
+        watch, circles = EdgeWatch(), Circles(truth.center, truth.radius, np.ones(len(truth)))
+        caplog.clear()
+        for _ in range(59):
+            watch.look(seen, circles, 0.7)
+        assert caplog.messages == []
+        for _ in range(150):
+            watch.look(seen, circles, 0.7)
+        assert len(caplog.messages) == (shift != (0, 0))
+        for text in caplog.messages:
+            side = {(5, 0): "right", (0, 5): "below", (0, -5): "above"}[shift]
+            found = re.search(rf"([\d.]+) px (?:to the )?{side}", text)
+            assert found is not None
+            assert float(found[1]) == pytest.approx(5, abs=1.3)
+
+
 def test_edges_that_do_not_move_or_lie_on_one_side_are_no_evidence(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
