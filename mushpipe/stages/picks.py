@@ -25,6 +25,7 @@ logger = logging.getLogger("mushpipe")
 SMALLEST_MM = 1.0
 LEVEL = 0.2  # of a camera that looks level, the rise along its axis
 HEIGHT = 0.3  # of a usual cap, in diameters
+TIP = 0.04  # sigma of the top of a cap about that of its model, in heights
 Rank = Literal["unoccluded", "highest", "largest", "score"]
 FlagName = Literal[
     "depth_missing",
@@ -238,11 +239,12 @@ def _sigma_position(picks: Picks) -> Floats:
     The picks come with that of the surface point, in the frame in which they are given. A cap that
     leans by an angle more than was found, about its middle, has its apex farther by that angle
     times its height, in any direction across its axis n: the covariance is
-    (height sigma)^2 (I - n n^T) / 2, sigma being that of the whole angle.
+    (height sigma)^2 (I - n n^T) / 2, sigma being that of the whole angle. Along the axis the top of
+    a pointed or flat cap is not where that of a model is: (`TIP` height)^2 n n^T.
     """
-    height = HEIGHT * picks.diameter
-    across = 0.5 * (height * picks.sigma_tilt)[:, None] ** 2 * np.maximum(1 - picks.axis**2, 0)
-    apex = np.sqrt(picks.sigma_position**2 + across)
+    height, along = HEIGHT * picks.diameter[:, None], picks.axis**2
+    across = 0.5 * (height * picks.sigma_tilt[:, None]) ** 2 * np.maximum(1 - along, 0)
+    apex = np.sqrt(picks.sigma_position**2 + across + (TIP * height) ** 2 * along)
     posed = (picks.flags & np.uint32(PickFlag.POSE_UNKNOWN)) == 0
     return np.where(posed[:, None], apex, picks.sigma_position)
 

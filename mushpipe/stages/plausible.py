@@ -11,6 +11,7 @@ from mushpipe.core.geometry import Camera, lengths
 _METRES = "are all lengths in metres, and all of this circle?"
 # No unit is mistaken for another by less. What is found differs by a factor of three at most.
 UNIT = 10.0
+LARGEST_M = 1.0  # no mushroom is larger, in metres
 
 
 def require_plausible(
@@ -22,6 +23,7 @@ def require_plausible(
     _require_distance(locations)
     if camera is not None:
         _require_size(circles, locations, poses, camera)
+    _require_mushrooms(locations)
 
 
 def _require_in_front(points: Floats, what: str) -> None:
@@ -62,6 +64,15 @@ def _require_size(circles: Circles, locations: Locations, poses: Poses, camera: 
         raise ValueError(
             f"row {row}: the apex of its pose is {way[row]:.3g} m from its location, but its "
             f"circle is {across[row]:.3g} m wide there, and so it is in most rows: {_METRES}"
+        )
+
+
+def _require_mushrooms(locations: Locations) -> None:
+    """Raise ValueError where most diameters are those of no mushroom."""
+    if (row := _usual(locations.diameter > LARGEST_M, locations.diameter)) is not None:
+        raise ValueError(
+            f"row {row}: its diameter is {locations.diameter[row]:.3g} m, and more than "
+            f"{LARGEST_M:g} m in most rows: are all lengths in metres?"
         )
 
 

@@ -88,7 +88,8 @@ def test_the_sigma_of_a_position_is_that_of_the_apex_where_there_is_one() -> Non
     axis /= np.linalg.norm(axis)
     lean = rng.normal(0, np.radians(sigma_deg) / np.sqrt(2), (n, 2))  # the angle is their length
     sides = np.stack([np.cross(axis, [0, 1, 0]), [0, 1, 0]])
-    apexes = height * (axis + lean @ sides) + rng.normal(0, surface, (n, 3))
+    top = 1 + rng.normal(0, 0.04, n)  # of the height of a model
+    apexes = height * (top[:, None] * axis + lean @ sides) + rng.normal(0, surface, (n, 3))
     found = replace(
         locations(DepthSource.MEASURED, DepthSource.MEASURED),
         sigma_position=np.full((2, 3), surface),
@@ -421,7 +422,7 @@ def test_spreads_turn_with_the_axes() -> None:
 
 
 def test_the_sigma_of_a_leaning_apex_turns_with_the_cap() -> None:
-    """Along the cap's axis, here z of the robot's frame, the apex of a leaning cap is as sure."""
+    """Along the cap's axis, here z of the robot's frame, no tilt moves the apex of a cap."""
     circles, found = circles_at((50, 50), (80, 50)), locations(*[DepthSource.MEASURED] * 2)
     found = replace(found, diameter=np.full(2, 0.05), sigma_position=np.zeros((2, 3)))
     lean = Rotation.from_euler("y", 135, degrees=True)  # takes z to an axis 45 degrees off upright
@@ -439,7 +440,8 @@ def test_the_sigma_of_a_leaning_apex_turns_with_the_cap() -> None:
         frame_of(np.zeros((120, 160))), circles, found, poses
     )
     across = 0.3 * 0.05 * np.radians(20) / np.sqrt(2)
-    np.testing.assert_allclose(picks.sigma_position[0], [across, across, 0], atol=1e-9)
+    along = 0.3 * 0.05 * 0.04
+    np.testing.assert_allclose(picks.sigma_position[0], [across, across, along], atol=1e-9)
 
 
 def test_a_mushroom_without_depth_hides_nothing() -> None:

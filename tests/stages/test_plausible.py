@@ -50,6 +50,12 @@ def test_a_distance_in_another_unit_is_refused() -> None:
         MakePicks().process(FRAME, CIRCLES, wrong)
 
 
+def test_lengths_that_are_all_in_mm_are_refused() -> None:
+    sized = {name: getattr(LOCATIONS, name) * 1000 for name in ("position", "distance", "diameter")}
+    with pytest.raises(ValueError, match=r"row 0: its diameter is [\d.]+ m, and more than 1 m in"):
+        MakePicks().process(FRAME, CIRCLES, replace(LOCATIONS, **sized))
+
+
 @pytest.mark.parametrize(
     ("apex", "message"),
     [
