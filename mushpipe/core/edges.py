@@ -114,7 +114,7 @@ def limited(frames: Iterator[RgbdFrame], source: Source) -> Iterator[RgbdFrame]:
     end_ns: float = math.inf
     for frame in islice(frames, source.max_frames):
         if source.max_seconds is not None and end_ns == math.inf:
-            end_ns = frame.header.stamp_ns + source.max_seconds * 1e9
+            end_ns = frame.header.stamp_ns + round(source.max_seconds * 1e9)
         if frame.header.stamp_ns >= end_ns:
             return
         yield frame

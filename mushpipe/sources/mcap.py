@@ -132,8 +132,8 @@ class McapSource(RecordedSource, ReplaySource):
             turn += 1
             # Numbers and time go on in the next turn, one average frame after the last one.
             shift += last.sequence - first.sequence + 1
-            span = last.stamp_ns - first.stamp_ns
-            shift_ns += span + span // max(1, player.frames - 1) if span else 33_333_333
+            span = last.stamp_ns - first.stamp_ns  # below 0 where a clock was set back
+            shift_ns += span + (span // max(1, player.frames - 1) if span > 0 else 33_333_333)
         faults = [f"damaged: {text}" for text in reader.damage]
         faults += [f"not all can be decoded: {player.error}"] if player.error else []
         if faults:

@@ -192,13 +192,14 @@ class CapFit(Stage):
         discs = discs_of(circles)
         noise = (self.depth_noise_mm / 1000, self.depth_noise_per_m / 1000)
         surface, covariance, _ = fit_tops(depth, camera, discs, noise, LEAST, holes, order)
-        fitted = np.isfinite(surface[:, 0])
-        tops, rows = (surface[fitted], covariance[fitted]), holes[fitted]
+        top = surface[:, 0] - self.depth_bias_mm / 1000
+        points = camera.deproject(discs[holes, :2], top)
+        fitted = np.isfinite(points).all(axis=1)  # beyond the image a lens may have no ray
+        tops, rows, z = (surface[fitted], covariance[fitted]), holes[fitted], top[fitted]
         discs = discs[rows]
-        z = tops[0][:, 0] - self.depth_bias_mm / 1000
         size, pixel = discs[:, 2] * z / camera.focal, self.circle_sigma_px * z / camera.focal
         along = variance_along(without_tip(*tops)[0], tops[1], size, pixel)
-        fits.surface[rows] = camera.deproject(discs[:, :2], z)
+        fits.surface[rows] = points[fitted]
         fits.sigma_surface[rows, 2] = np.maximum(fits.sigma_surface[rows, 2], np.sqrt(along))
 
 

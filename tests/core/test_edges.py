@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from mushpipe import Header, InputError, RgbdFrame, Sink, Stage
-from mushpipe.core.edges import paced
+from mushpipe.core.edges import limited, paced
 from tests.core.lab import Frames, Lab, make_frame, soon
 
 
@@ -34,6 +34,14 @@ def test_what_failed_to_open_is_closed_too_and_nothing_runs(lab: Lab, where, cal
     assert seen == calls
     assert str(report.error).endswith(f"failed: OSError: open {where}")
     assert (report.exit_code, report.processed) == (1, 0)
+
+
+def test_seconds_end_before_the_frame_that_begins_the_next_one_to_the_nanosecond():
+    source = Frames(max_seconds=1.0)
+    for start_ns in range(1_700_000_000_123_456_000, 1_700_000_000_123_456_400):
+        headers = [Header(start_ns + k * 10**8, k, "camera") for k in range(12)]
+        frames = (make_frame(header=header) for header in headers)
+        assert len(list(limited(frames, source))) == 10
 
 
 @pytest.mark.parametrize("where", ["source", "stage", "sink"])

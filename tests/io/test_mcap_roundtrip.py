@@ -100,6 +100,17 @@ def test_numbers_go_on_in_a_loop_over_part_of_a_recording(tmp_path: Path) -> Non
     assert [frame.header.sequence for frame in frames] == [13, 14, 15, 16, 17, 18]
 
 
+def test_in_a_loop_time_goes_on_where_a_clock_was_set_back(tmp_path: Path) -> None:
+    stamps = [T0 + at for at in (0, PERIOD, 2 * PERIOD, -60 * PERIOD, -59 * PERIOD)]
+    headers = [Header(stamp, 10 + k, OPTICAL, stamp + 7) for k, stamp in enumerate(stamps)]
+    frames = [replace(make_frame(k), header=header) for k, header in enumerate(headers)]
+    path = record(tmp_path / "out.mcap", list(map(trace_of, frames)))
+    played = [frame.header.stamp_ns for frame in play(path, loop=3)]
+    steps = np.diff(played)
+    assert np.diff(stamps).tolist() == steps[:4].tolist() == steps[5:9].tolist()
+    assert [PERIOD / 2 < step < 2 * PERIOD for step in steps[[4, 9]]] == [True, True]
+
+
 def unknown(n: int, *shape: int) -> Any:
     """Draw (n, *shape) floats of which some rows are unknown: NaN."""
     size = int(np.prod(shape, dtype=int))

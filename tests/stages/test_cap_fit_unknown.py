@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mushpipe import Circles, DepthSource, InputError, RgbdFrame
+from mushpipe import Camera, Circles, DepthSource, Header, InputError, RgbdFrame
 from mushpipe.stages.cap_fit import CapFit
 from tests.stages.caps import (
     CAMERA,
@@ -109,3 +109,15 @@ def test_a_cap_that_does_not_fit_the_model_says_so_in_its_sigmas() -> None:
 def test_an_upright_without_direction_is_refused() -> None:
     with pytest.raises(ValueError, match="the upright has no direction"):
         CapFit.model_validate({"up": [0, 0, 0]})
+
+
+def test_a_centre_beyond_the_image_where_the_lens_has_no_ray_ends_no_run() -> None:
+    lens = (-0.375, 0.023, 0.0056, -0.0064, 0.0)
+    camera = Camera(640, 480, 511.0, 511.0, 319.5, 239.5, "brown_conrady", lens)
+    circles = Circles([[-13.7, 321.8]], [57.7], [1.0])
+    assert np.isnan(camera.deproject(circles.center, np.ones(1))).any()
+    color, depth = np.full((480, 640, 3), 90, np.uint8), np.full((480, 640), 0.45, np.float32)
+    frame = RgbdFrame(Header(0, 0, "camera"), color, depth, 1.0, camera)
+    locations, poses, _ = CapFit(up="camera").process(frame, circles)
+    assert locations.source[0] != DepthSource.MEASURED
+    assert not poses.valid[0] or poses.sigma_rad[0] > 1
