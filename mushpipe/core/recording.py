@@ -187,6 +187,8 @@ class RecordingReader:
                         yield record
                     elif wanted(record):
                         yield from self._unpack(record, as_written)
+                if behind := limit - file.tell():
+                    self._note(f"{behind} bytes behind its end were not read: another recording?")
             except InvalidMagic:
                 self._note("its last bytes are missing")
             except CRCValidationError:

@@ -44,6 +44,7 @@ class StreamSource(RecordedSource):
 
     _number: int = PrivateAttr(0)
     _records: Iterator[McapRecord] = PrivateAttr(default_factory=lambda: iter(()))
+    _input: BufferedReader | None = PrivateAttr(None)
     _manifest: dict[str, str] = PrivateAttr(default_factory=dict)
     _counts: Counter[str] = PrivateAttr(default_factory=Counter)
     _interrupted: threading.Event = PrivateAttr(default_factory=threading.Event)
@@ -70,8 +71,8 @@ class StreamSource(RecordedSource):
                 "nothing is piped into this program: 'mushpipe record -o - | mushpipe run GRAPH "
                 "--source -'"
             )
-        stdin = BufferedReader(_Input(self._number, self._interrupted), _BUFFER)
-        records = StreamReader(stdin, validate_crcs=True).records
+        self._input = BufferedReader(_Input(self._number, self._interrupted), _BUFFER)
+        records = StreamReader(self._input, validate_crcs=True).records
         try:
             head = list(islice(records, 2))  # the header; the manifest, if mushpipe sends
         except InvalidMagic as error:
@@ -134,11 +135,19 @@ class StreamSource(RecordedSource):
             yield frame
         if self._interrupted.is_set():
             return
-        if reader.damage or player.error:
-            damage = player.error or reader.damage
+        damage = player.error or reader.damage or self._behind()
+        if damage:
             raise InputError(f"the stream {damage}; {player.frames} frames came")
         if not player.frames:
             raise InputError(self._nothing_on(topics.color, reader))
+
+    def _behind(self) -> str:
+        """Return what is amiss if something follows the end of the recording."""
+        if self._input is None or not isinstance(self._input.raw, _Input):
+            return ""
+        self._input.raw.patient = False
+        more = self._input.peek(1)
+        return "goes on behind its end: send one recording at a time" if more else ""
 
     def _nothing_on(self, topic: str, reader: _Messages) -> str:
         found = ", ".join(sorted(reader.topics)) or "nothing"
@@ -182,6 +191,7 @@ class _Input(RawIOBase):
     def __init__(self, number: int, interrupted: threading.Event) -> None:
         self._number = number
         self._interrupted = interrupted
+        self.patient = True  # else what does not come soon is taken for the end
 
     def readable(self) -> bool:
         return True
@@ -190,4 +200,6 @@ class _Input(RawIOBase):
         while not self._interrupted.is_set():
             if select.select([self._number], [], [], _POLL_S)[0]:
                 return os.readv(self._number, [buffer])
+            if not self.patient:
+                break
         return 0

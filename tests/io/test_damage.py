@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -158,6 +159,18 @@ def test_a_damaged_index_costs_nothing_but_is_reported(whole: Path, tmp_path: Pa
     assert len(frames) == FRAMES
     assert all(frame.depth is not None and frame.camera is not None for frame in frames)
     assert "its index is corrupt" in str(error)
+
+
+@pytest.mark.parametrize("behind", [lambda data: b"\n", lambda data: data, lambda data: data[:-99]])
+def test_what_follows_the_end_of_a_recording_is_reported(
+    behind: Callable[[bytes], bytes], whole: Path, tmp_path: Path
+) -> None:
+    data = whole.read_bytes()
+    more = behind(data)
+    frames, error = read_damaged(tmp_path / "two.mcap", data + more)
+    assert len(frames) == FRAMES
+    assert error is not None
+    assert f"{len(more)} bytes behind its end were not read: another recording?" in str(error)
 
 
 def test_a_record_whose_type_is_damaged_is_missed(whole: Path, tmp_path: Path) -> None:

@@ -167,6 +167,33 @@ def test_a_stream_cut_anywhere_gives_whole_frames_and_an_error(share: float) -> 
             assert np.array_equal(frame.color, picture(i)[0])
 
 
+@pytest.mark.parametrize("piped", [True, False])
+def test_a_second_recording_in_a_stream_is_not_lost_without_a_word(
+    tmp_path: Path, piped: bool
+) -> None:
+    one = stream(tmp_path / "one.mcap", 3).read_bytes()
+    (tmp_path / "two.mcap").write_bytes(one + one)
+    source = source_of(tmp_path / "two.mcap", piped)()
+    source.open()
+    frames = []
+    with pytest.raises(InputError, match=r"goes on behind its end.*; 3 frames came"):
+        frames.extend(source.frames())
+    source.close()
+
+
+def test_a_sender_that_keeps_its_pipe_open_ends_the_run_all_the_same(tmp_path: Path) -> None:
+    number, end = os.pipe()
+    threading.Thread(
+        target=os.write, args=(end, stream(tmp_path / "s.mcap", 2).read_bytes()), daemon=True
+    ).start()
+    source = StreamSource()
+    source._number = number
+    source.open()
+    assert len(list(source.frames())) == 2
+    os.close(end)
+    os.close(number)
+
+
 def test_a_stream_without_images_names_what_it_holds(tmp_path: Path) -> None:
     source = opened(stream(tmp_path / "s.mcap", 2), color_topic="/left")
     with pytest.raises(InputError, match=r"no colour images on /left, only /camera/"):
