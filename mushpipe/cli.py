@@ -108,7 +108,7 @@ def run(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log more")] = False,
 ) -> None:
     """Run a graph on its source, or on another one given by --source."""
-    from mushpipe.console import execute, set_up_logging
+    from mushpipe.console import NOT_AGAIN, execute, set_up_logging, stderr
     from mushpipe.core.manifest import manifest_path
 
     set_up_logging(verbose)
@@ -122,6 +122,8 @@ def run(
     plan = _compile(graph, [*overrides, *(set_ or [])], source, more)
     repeated = graph.suffix == ".mcap" and source is None  # its frame is saved already
     report = execute(plan, manifest or manifest_path(plan), None if repeated else capsules)
+    if repeated and report.processed and not report.failed:
+        stderr.print(NOT_AGAIN, style="yellow")
     raise typer.Exit(report.exit_code)
 
 

@@ -27,6 +27,10 @@ from mushpipe.core.run import run
 
 # Names may hold brackets, which are no markup.
 stderr = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
+NOT_AGAIN = (
+    "this frame does not fail again: what failed depends on the frames before it, or on something "
+    "outside of the graph"
+)
 
 
 def set_up_logging(verbose: bool) -> None:
@@ -156,5 +160,5 @@ def show_report(report: RunReport) -> None:
         stderr.print("the balance does not close: frames were lost unaccounted", style="bold red")
     for path in report.capsules:
         stderr.print(
-            f"the failing frame is saved: mushpipe run {path} repeats the failure, -v says where"
+            f"the failing frame is saved: mushpipe run {path} runs it again, -v says where it fails"
         )

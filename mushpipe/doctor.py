@@ -112,13 +112,15 @@ def _plugins() -> Iterator[Finding]:
 
     registry = load_registry()
     for broken in registry.broken:
-        cure = f"pip install --upgrade {broken.distribution}, or uninstall it"
+        cure = f"pip install --upgrade {broken.distribution}, or mend or uninstall it"
         yield Finding(f"plugin {broken.name}", State.error, broken.reason, cure)
     for (kind, name), entries in registry.entries.items():
         if len(entries) > 1:
             packages = [entry.distribution for entry in entries]
             text = f"is provided by {' and '.join(packages)}"
             cure = f"write {packages[0]}:{name} in graphs, or uninstall one"
+            if len(set(packages)) == 1:
+                cure = f"{packages[0]} must register it once"
             yield Finding(f"{kind} {name}", State.warning, text, cure)
     if not registry.broken:
         yield Finding("plugins", State.ok, f"{len(registry.entries)} registered, none failed")

@@ -7,7 +7,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from itertools import islice
 from pathlib import Path
@@ -228,6 +228,8 @@ class SourceThread(threading.Thread):
     def _read(self) -> None:
         speed = self.source.speed if isinstance(self.source, ReplaySource) else 0.0
         frames = self.source.frames()
+        if not isinstance(frames, Iterable):
+            raise TypeError(f"its frames() gave {frames!r}, expected frames, as by yield")
         timed_frames = timed(frames, self.durations)
         try:
             seen = judged(paced(timed_frames, speed, self.stop), self.source.name())

@@ -142,11 +142,10 @@ class Registry:
         if len(found) == 1:
             return found[0].load()
         if found:
-            raise PluginError(
-                f"{kind} '{name}' is provided by "
-                + " and ".join(f"{e.distribution} {e.version}" for e in found)
-                + f"; write '{found[0].distribution}:{name}' or '{found[1].distribution}:{name}'"
-            )
+            by = " and ".join(f"{e.distribution} {e.version}".strip() for e in found)
+            choice = sorted({f"'{e.distribution}:{name}'" for e in found})
+            cure = f"write {' or '.join(choice)}" if len(choice) > 1 else "register it there once"
+            raise PluginError(f"{kind} '{name}' is provided by {by}; {cure}")
         raise PluginError(self._unknown(kind, use))
 
     def _unknown(self, kind: Kind, use: str) -> str:

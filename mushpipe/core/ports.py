@@ -147,6 +147,11 @@ def _port(plugin: type[Plugin], parameter: Parameter, hints: dict[str, Any]) -> 
         left = [member for member in members if member is not NoneType]
         if len(left) == 1 and len(members) == 2:
             hint, required = left[0], False
+    if parameter.kind in (Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD):
+        raise PluginError(
+            f"{plugin.__qualname__}: '{parameter}' stands for any number of parameters; each input "
+            "needs one of its own"
+        )
     if not _is_class(hint) or parameter.kind is not Parameter.POSITIONAL_OR_KEYWORD:
         raise PluginError(
             f"{plugin.__qualname__}: parameter '{parameter.name}' must be annotated with one type"

@@ -48,6 +48,9 @@ _OTHERS = {
     b"#ROSBAG ": f"a bag of ROS 1: {CONVERT.format('FILE')} makes MCAP of it; one of Intel's "
     "viewer is played where its name ends with .bag",
     ZSTD: "compressed as a whole: 'zstd -d FILE' unpacks it",
+    **dict.fromkeys(
+        (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"), "an image: give its folder to play all of them"
+    ),
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -138,9 +139,10 @@ def truth_of_labels(path: Path) -> TruthSet:
         raise InputError(text) from error
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: no labels: {error}") from error
+    for (key, value), times in Counter(map(_place, labels.frames)).items():
+        if times > 1:
+            raise InputError(f"{path}: the frame of {key} {value} is labelled {times} times")
     frames = {_place(frame): _frame_truth(path, frame, labels.frame_id) for frame in labels.frames}
-    if len(frames) < len(labels.frames):
-        raise InputError(f"{path}: a frame is labelled twice")
     return TruthSet(path.name, frames)
 
 

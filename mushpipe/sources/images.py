@@ -88,9 +88,11 @@ def _decode_compressed_color(message: Any) -> Bytes:
 
     # Depth is not turned as a camera's EXIF may ask for colour.
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(np.frombuffer(message.data, np.uint8), flags)
+    data = np.frombuffer(message.data, np.uint8)
+    image = cv2.imdecode(data, flags) if len(data) else None
     if image is None:
-        raise ValueError(f"compressed image ({message.format or 'no format'}) cannot be decoded")
+        what = f"{message.format or 'no format'}, {len(data)} bytes"
+        raise ValueError(f"compressed image ({what}) cannot be decoded")
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 
@@ -132,7 +134,10 @@ def _decode_compressed_depth(message: Any, scale: float | None) -> tuple[NDArray
     data = bytes(message.data)
     at = data.find(_PNG, 0, 16)
     if at < 0:
-        raise ValueError(f"compressed depth '{message.format}' is not supported: only PNG is")
+        raise ValueError(
+            f"compressed depth '{message.format}' holds no PNG in its {len(data)} bytes, and only "
+            "PNG is supported"
+        )
     image = cv2.imdecode(np.frombuffer(data[at:], np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None or image.dtype != np.uint16 or image.ndim != 2:
         raise ValueError(f"compressed depth '{message.format}' holds no 16-bit image")
@@ -161,17 +166,19 @@ def decode_camera(message: Any, rectified: bool) -> Camera | None:
             for them then, not K and D.
 
     Raises:
-        ValueError: The distortion model is one that is not implemented, a number is not finite, the
-            matrix has more in it than a pinhole camera, or the calibration says not for which size
-            of image it is.
+        ValueError: The distortion model is one that is not implemented, a number is not finite, a
+            focal length not above 0, the matrix has more in it than a pinhole camera, or the
+            calibration says not for which size of image it is.
     """
     k = list(message.k if hasattr(message, "k") else message.K)
     d = distortion(message)
     if rectified:
         p, d = list(message.p if hasattr(message, "p") else message.P), []
         k = [*p[:3], *p[4:7], *p[8:11]] if len(p) == 12 and p[0] > 0 else k
-    if len(k) != 9 or not (k[0] > 0 and k[4] > 0):
+    if len(k) != 9 or not (k[0] or k[4]):
         return None
+    if not (k[0] > 0 and k[4] > 0):
+        raise ValueError(f"its focal lengths are {k[0]:g} and {k[4]:g} px, expected above 0")
     if any((k[1], k[3], k[6], k[7])):  # sheared, or written column by column
         raise ValueError(f"its matrix is no fx 0 cx, 0 fy cy, 0 0 1, but {[float(v) for v in k]}")
     if not (message.width and message.height):

@@ -66,11 +66,35 @@ def test_the_program_repeats_the_failure(lab: Lab, graph: str, monkeypatch, caps
     (lab.folder / "graph.yaml").write_text(graph)
     assert cli(monkeypatch, "run", "graph.yaml") == 1
     first = capsys.readouterr().err
-    assert "mushpipe run failures/failure-rich-b-2.mcap repeats the failure, -v says where" in first
+    assert (
+        "mushpipe run failures/failure-rich-b-2.mcap runs it again, -v says where it fails" in first
+    )
     assert cli(monkeypatch, "run", "failures/failure-rich-b-2.mcap") == 1
     error = first[first.index("error: ") :]
     assert capsys.readouterr().err.endswith(error)
     assert len([*(lab.folder / "failures").iterdir()]) == 1
+
+
+def test_of_a_failure_that_does_not_come_again_the_program_says_so(
+    lab: Lab, graph: str, monkeypatch, capsys
+):
+    class Once(Stage):
+        _frames = 0
+
+        def process(self, frame: RgbdFrame) -> Mask:
+            self._frames += 1
+            if self._frames == 2:
+                raise RuntimeError("the second frame")
+            return Mask(np.zeros(frame.color.shape[:2], bool))
+
+    monkeypatch.chdir(lab.folder)
+    monkeypatch.setattr("mushpipe.core.plugins.load_registry", lambda: lab.registry)
+    Path("graph.yaml").write_text(lab.chain(Once))
+    assert cli(monkeypatch, "run", "graph.yaml") == 1
+    assert "does not fail again" not in capsys.readouterr().err
+    (capsule,) = Path("failures").iterdir()
+    assert cli(monkeypatch, "run", str(capsule)) == 0
+    assert "this frame does not fail again" in capsys.readouterr().err
 
 
 def test_a_capsule_keeps_the_resolved_graph_without_its_sinks(lab: Lab, graph: str):

@@ -36,6 +36,13 @@ def test_places_of_keys_and_values_count_from_one():
 
 
 BROKEN = {
+    "merge key": (
+        "a: &a {c: 1}\nb: {<<: *a, d: 2}\n",
+        """g.yaml:2:5: a merge key (<<) is not known here
+    b: {<<: *a, d: 2}
+        ^
+    write the settings out""",
+    ),
     "key twice": (
         "a: 1\nb: {c: 1, c: 2}\n",
         """g.yaml:2:11: the key 'c' stands twice

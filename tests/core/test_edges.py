@@ -36,6 +36,17 @@ def test_what_failed_to_open_is_closed_too_and_nothing_runs(lab: Lab, where, cal
     assert (report.exit_code, report.processed) == (1, 0)
 
 
+def test_a_source_that_gives_no_frames_is_told_of(lab: Lab):
+    class Nothing(Frames):
+        def frames(self):
+            list(super().frames())
+
+    lab.registry.source("nothing", Nothing)
+    report = lab.run(lab.chain("threshold", source="nothing"))
+    assert "its frames() gave None, expected frames, as by yield" in str(report.error)
+    assert report.balanced()
+
+
 def test_seconds_end_before_the_frame_that_begins_the_next_one_to_the_nanosecond():
     source = Frames(max_seconds=1.0)
     for start_ns in range(1_700_000_000_123_456_000, 1_700_000_000_123_456_400):

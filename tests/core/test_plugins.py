@@ -217,6 +217,14 @@ def test_two_plugins_of_one_name_must_be_told_apart(site, monkeypatch, capsys):
     assert find(registry, "bbb:nothing").__module__ == "bbb"
 
 
+def test_a_package_that_registers_a_name_twice_is_told_of_and_no_choice_is_offered():
+    registry = Registry()
+    registry.stage("twice", "a:A")
+    registry.stage("twice", "a:B")
+    with pytest.raises(PluginError, match=r"by this process and this process; register it there"):
+        find(registry, "twice")
+
+
 def test_a_package_may_name_its_module_once_per_stage(site):
     install(site, "fungus", GOOD)
     points = site / "fungus-1.2.dist-info" / "entry_points.txt"

@@ -101,7 +101,7 @@ RETURNS = "Declared.process must be annotated with what it returns: a type, or a
         (no_annotation, "Declared: parameter 'frame' must be annotated with one type"),
         (two_types, "Declared: parameter 'frame' must be annotated with one type"),
         (three_types, "Declared: parameter 'frame' must be annotated with one type"),
-        (starred, "Declared: parameter 'frames' must be annotated with one type"),
+        (starred, "Declared: '*frames: "),
         (keyword_only, "Declared: parameter 'frame' must be annotated with one type"),
         (no_return, RETURNS),
         (none_return, RETURNS),

@@ -124,7 +124,7 @@ def test_conversion_leaves_the_own_format_alone() -> None:
         ({"mushpipe_labels": 2, "frames": []}, "mushpipe_labels"),
         (
             {"mushpipe_labels": 1, "frames": [{"index": 0, "caps": []}, {"index": 0, "caps": []}]},
-            "labelled twice",
+            "the frame of index 0 is labelled 2 times",
         ),
         (
             {

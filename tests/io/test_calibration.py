@@ -320,6 +320,16 @@ def test_a_camera_has_finite_numbers(value: float) -> None:
         Camera(WIDTH, HEIGHT, FX, FY, value, CY)
 
 
+@pytest.mark.parametrize("fx", [float("nan"), -600.0])
+def test_a_focal_length_that_is_none_is_told_of_and_not_taken_for_no_calibration(
+    fx: float, tmp_path: Path
+) -> None:
+    path = write_bag(tmp_path, [info_at(0, k=(fx, 0, CX, 0, FY, CY, 0, 0, 1)), *COLORS])
+    frames, error = drain(McapSource(path=path))
+    assert [frame.camera for frame in frames] == [None] * 3
+    assert f"{COLOR_INFO}: its focal lengths are {fx:g} and {FY:g} px, expected" in str(error)
+
+
 def test_after_a_calibration_that_cannot_be_decoded_none_is_known(tmp_path: Path) -> None:
     later = info_at(1, model="equidistant", d=(0.1, 0.2, 0.3, 0.4))
     path = write_bag(tmp_path, [info_at(0), COLORS[0], later, *COLORS[1:]])

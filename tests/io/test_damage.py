@@ -191,6 +191,8 @@ def test_a_record_whose_type_is_damaged_is_missed(whole: Path, tmp_path: Path) -
         (b"", "the file is empty"),
         (b"MThd\0\0\0\6\0", "not an MCAP file (it begins with b'MThd\\x00\\x00\\x00\\x06')"),
         (b"\x89MC", "not an MCAP file"),
+        (b"\xff\xd8\xff\xe0\0\x10JFIF", "not an MCAP file (it is an image: give its folder"),
+        (b"\x89PNG\r\n\x1a\n\0\0", "not an MCAP file (it is an image: give its folder"),
     ],
 )
 def test_a_file_that_is_no_recording_is_refused(
@@ -302,17 +304,19 @@ def test_images_that_cannot_be_decoded_are_counted_and_the_others_played(tmp_pat
     assert "3 frames could be read" in str(error)
 
 
-def test_garbage_in_place_of_a_jpeg_is_counted(tmp_path: Path) -> None:
+@pytest.mark.parametrize("size", [50, 0])
+def test_garbage_in_place_of_a_jpeg_is_counted(size: int, tmp_path: Path) -> None:
     topic = COLOR + "/compressed"
     entries = [
-        (topic, T0 + i, compressed(bytes([i] * 50), "rgb8; jpeg compressed bgr8", T0 + i))
+        (topic, T0 + i, compressed(bytes([i] * size), "rgb8; jpeg compressed bgr8", T0 + i))
         for i in range(3)
     ]
     source = McapSource(path=write_bag(tmp_path, entries))
     frames, error = drain(source)
     assert frames == []
     assert source.counts() == {"images that could not be decoded": 3}
-    assert "compressed image (rgb8; jpeg compressed bgr8) cannot be decoded" in str(error)
+    what = f"rgb8; jpeg compressed bgr8, {size} bytes"
+    assert f"compressed image ({what}) cannot be decoded" in str(error)
 
 
 @pytest.mark.parametrize(

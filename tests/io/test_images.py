@@ -183,7 +183,11 @@ def test_compressed_depth_in_metres_undoes_its_quantisation(tmp_path: Path) -> N
 BAD_DEPTH = [
     (
         compressed(b"\0" * 12 + b"\1\2\3\4" * 30, "16UC1; compressedDepth rvl"),
-        "compressed depth '16UC1; compressedDepth rvl' is not supported: only PNG is",
+        "compressed depth '16UC1; compressedDepth rvl' holds no PNG in its 132 bytes",
+    ),
+    (
+        compressed(b"\0\1\2", "16UC1; compressedDepth png"),
+        "compressed depth '16UC1; compressedDepth png' holds no PNG in its 3 bytes",
     ),
     (
         compressed(depth_png(MM.astype(np.uint8)), "16UC1; compressedDepth png"),
