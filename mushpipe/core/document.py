@@ -171,11 +171,8 @@ class _Builder:
             key = key_node.value if isinstance(key_node, yaml.ScalarNode) else "?"
             mark = (key_node.start_mark.line + 1, key_node.start_mark.column + 1)
             if key_node.tag.endswith(":merge"):
-                text, excerpt = (
-                    "a merge key (<<) is not known here",
-                    self.document._excerpt(mark[0]),
-                )
-                hint = "write the settings out"
+                text, hint = "a merge key (<<) is not known here", "write the settings out"
+                excerpt = self.document._excerpt(mark[0])
                 self.problems.append(Problem(self.document.file, *mark, text, hint, excerpt))
                 continue
             if key in seen:
