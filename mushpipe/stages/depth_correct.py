@@ -83,11 +83,14 @@ def corrected(depth: NDArray[Any], scale: float, errors: Singles, end: np.float3
     What is missing, from the end of the scale on, or not above 0 afterwards, is 0.
     """
     out = np.empty(depth.shape, np.float32)
-    unit, per_m = np.float32(scale), np.float32(1 / scale)
+    unit, per_m, none = np.float32(scale), np.float32(1 / scale), np.float32(0)
+    constant, linear, square = errors[0], errors[1], errors[2]
     for y in range(depth.shape[0]):
-        for x in range(depth.shape[1]):
-            value = np.float32(depth[y, x])
-            z = value * unit if value < end else np.float32(0)
-            left = z - (errors[0] + z * (errors[1] + z * errors[2]))
-            out[y, x] = left * per_m if z > 0 and 0 < left < np.inf else np.float32(0)
+        row, to = depth[y], out[y]
+        for x in range(depth.shape[1]):  # without branches, for SIMD
+            value = np.float32(row[x])
+            z = value * unit
+            left = z - (constant + z * (linear + z * square))
+            known = (value < end) & (z > none) & (left > none) & (left < np.inf)
+            to[x] = left * per_m if known else none
     return out
