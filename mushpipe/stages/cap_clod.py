@@ -14,7 +14,7 @@ import numpy as np
 from mushpipe import Circles
 from mushpipe.core.arrays import Bools, Bytes, Floats, locked
 from mushpipe.core.jit import borrower
-from mushpipe.stages.cap_kin import DARK, UNIT, Kin, distances, write_tone
+from mushpipe.stages.cap_kin import DARK, UNIT, Kin, alike, write_tone
 from mushpipe.stages.discs import LIKELY, discs_of
 
 ODD = 1.5  # distance to the nearer half of the sure caps from which on it is none of them
@@ -42,7 +42,7 @@ def clods(color: Bytes, circles: Circles, kin: Kin) -> Bools:
     """
     if not len(kin.sure):
         return np.zeros(len(circles), np.bool_)
-    odd = distances(*kin, -(-len(kin.sure) // 2)) > ODD
+    odd = 2 * alike(*kin, ODD) < len(kin.sure)
     return off_ground(color, circles, kin.tones, odd) < ALIKE
 
 

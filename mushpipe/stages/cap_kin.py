@@ -99,6 +99,19 @@ def write_tone(red: float, green: float, blue: float, tone: Floats) -> None:
 
 
 @jit
+def alike(tones: Floats, sure: Ints, reach: float) -> Ints:
+    """Return how many of the sure ones, itself aside, are within a distance of each (N,)."""
+    found, square = np.zeros(len(tones), np.int64), reach * reach
+    for k in range(len(tones)):
+        for m in sure:
+            squares = 0.0
+            for tone in range(tones.shape[1]):
+                squares += (tones[k, tone] - tones[m, tone]) ** 2
+            found[k] += squares <= square and m != k
+    return found
+
+
+@jit
 def distances(tones: Floats, sure: Ints, nearest: int) -> Floats:
     """Return how far each (N,) is from the so many nearest of the sure ones, itself aside."""
     found, least = np.empty(len(tones)), np.empty(nearest)  # the squares so far, in order

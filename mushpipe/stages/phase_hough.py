@@ -163,7 +163,7 @@ class PhaseHough(Stage):
         # them, and what is a cap only beside it is no more likely than it is.
         after = np.logical_or.accumulate(score < LIKELY)
         score[after] = np.minimum.accumulate(score[after])
-        owner[np.isin(owner, np.flatnonzero(after))] = -1
+        owner[np.append(after, False)[owner]] = -1  # an owner of -1 stays one
         polish(found.edges, found.relief, shapes, owner, found.radii)
         circles = Circles(shapes[:, :2], equal_area_radius(shapes), score)
         if found.learned is None:
