@@ -6,6 +6,7 @@ import json
 import logging
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -74,6 +75,9 @@ def progress_bar(size: Callable[[], int] | None = None) -> Iterator[Any]:
         size: Returns the bytes written so far, where they are to be shown.
     """
     if not stderr.is_terminal:
+        jit = sys.modules.get("mushpipe.core.jit")  # of a graph that has kernels
+        if jit is not None and jit.cold():
+            logging.getLogger("mushpipe").info("the first run of all compiles: a minute")
         yield None
         return
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())

@@ -65,6 +65,11 @@ if not os.environ.get("NUMBA_CACHE_DIR"):
     numba.config.CACHE_DIR = str(_cache_folder())  # type: ignore[attr-defined]
 
 
+def cold() -> bool:
+    """Return whether nothing was compiled yet: the first run of all takes a minute more."""
+    return next(Path(numba.config.CACHE_DIR).rglob("*.nbi"), None) is None  # type: ignore[attr-defined]
+
+
 class _SelfContained(JITCodeLibrary):
     """A kernel with copies of all that it calls for itself.
 

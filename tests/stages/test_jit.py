@@ -186,3 +186,24 @@ def test_kernels_are_the_same_on_all_x86_processors_of_the_last_ten_years() -> N
     assert wide == "False"
     assert (name, bare) == ("x86-64-v3", "True") or able == "False"
     assert compiled(NUMBA_CPU_NAME="x86-64")[0] == "x86-64"
+
+
+def test_the_first_run_of_all_is_told_of_where_no_terminal_shows_it(tmp_path: Path) -> None:
+    graph = tmp_path / "graph.yaml"
+    graph.write_text(
+        "mushpipe: 1\n"
+        "source: {use: synthetic, max_frames: 1, width: 64, height: 48, distance: 0.3}\n"
+        "stages: {correct: {use: depth-correct}}\n"
+    )
+    told = [
+        subprocess.run(
+            [sys.executable, "-m", "mushpipe", "run", "graph.yaml"],
+            cwd=tmp_path,
+            env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kernels")},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stderr
+        for _ in range(2)
+    ]
+    assert ["the first run of all compiles" in text for text in told] == [True, False]
