@@ -151,7 +151,9 @@ class Connection:
 
     def _room(self, now: float) -> bool:
         """Return whether the kernel takes a line: in a queue behind others it would grow old."""
-        full = not select.select((), (self.sock,), (), 0)[1]
+        poll = select.poll()
+        poll.register(self.sock, select.POLLOUT)
+        full = not poll.poll(0)
         if full and not self._full:
             self._progress = now
         self._full = full

@@ -23,6 +23,7 @@ ENOUGH, AMISS, SHIFTED = 100, 1.5, 2.0
 # After so many frames FEW are judged by, too, for a camera that stands still sees no others; they
 # may lie UNSURE further off. It is looked again each time so many frames have come.
 PATIENCE, FEW, UNSURE = 60, 12, 1.5
+LATEST = 1000  # edges, and circles, that are kept
 _OUTLIER = 2.0  # px from what is usual
 # Least eigenvalue of the normal matrix; 0.5 where all sides are alike. A projector's shadow hides
 # depth beside each cap on one side: beds have 0.05 to 0.3, and tell shifts of 5 px to about 1 px.
@@ -39,7 +40,7 @@ class EdgeWatch:
     """Looks at edges of caps until it can judge where depth shows them; tells what is amiss."""
 
     def __init__(self) -> None:
-        self._gaps: list[Floats] | None = []  # None once they were judged
+        self._gaps: Floats | None = np.zeros((0, 3))  # None once they were judged
         self._seen = np.zeros((0, 2))  # centres of the circles that were looked at, px
         self._frames = 0
 
@@ -58,9 +59,8 @@ class EdgeWatch:
         # Where nothing moves, the same edges again would say nothing new.
         away = np.linalg.norm(circles.center[:, None] - self._seen, axis=2)
         new = circles.take((away > circles.radius[:, None]).all(axis=1))
-        self._seen = np.concatenate([self._seen, new.center])
-        self._gaps.append(edge_gaps(frame, new))
-        gaps = np.concatenate(self._gaps)
+        self._seen = np.concatenate([self._seen, new.center])[-LATEST:]
+        self._gaps = gaps = np.concatenate([self._gaps, edge_gaps(frame, new)])[-LATEST:]
         enough = len(gaps) >= ENOUGH
         found = usual(gaps) if enough or (patient and len(gaps) >= FEW) else None
         if found is None:
