@@ -111,6 +111,12 @@ class Registry:
         self._add("sink", name, target)
 
     def _add(self, kind: Kind, name: str, target: type[Plugin] | str) -> None:
+        placed = isinstance(target, type) or (isinstance(target, str) and ":" in target)
+        if not placed or not re.fullmatch(r"[\w-]+", name):
+            raise PluginError(
+                f"{kind} {name!r} is registered as {target!r}: expected a name of letters, digits, "
+                "_ and -, and a class or 'package.module:Class'"
+            )
         self.entries[kind, name].append(Entry(kind, name, target, *self._owner))
 
     def names(self, kind: Kind) -> list[str]:

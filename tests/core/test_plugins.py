@@ -217,6 +217,14 @@ def test_two_plugins_of_one_name_must_be_told_apart(site, monkeypatch, capsys):
     assert find(registry, "bbb:nothing").__module__ == "bbb"
 
 
+@pytest.mark.parametrize(
+    ("name", "target"), [("bad name!", "a:A"), ("pf:x", "a:A"), ("x", 5), ("x", "a.A")]
+)
+def test_a_registration_that_no_graph_could_use_is_refused(name: str, target: object):
+    with pytest.raises(PluginError, match="expected a name of letters"):
+        Registry().stage(name, target)  # type: ignore[arg-type]
+
+
 def test_a_package_that_registers_a_name_twice_is_told_of_and_no_choice_is_offered():
     registry = Registry()
     registry.stage("twice", "a:A")
