@@ -111,11 +111,16 @@ def recorded_cases(path: Path) -> Iterator[Case]:
             yield Case(path.stem, "", frame.header.sequence, frame, truth)
 
 
+def _cases(counts: dict[str, int], first: int, apart: int, cache: Path) -> Iterator[Case]:
+    """Yield so many frames of each condition, whose seeds begin so far apart."""
+    for number, (condition, count) in enumerate(counts.items()):
+        for k in range(count):
+            yield render(condition, "a", first + apart * number + k, cache)
+
+
 def training_cases(cache: Path) -> Iterator[Case]:
     """Yield the frames that the verifier is trained on."""
-    for number, (condition, count) in enumerate(TRAINING.items()):
-        for k in range(count):
-            yield render(condition, "a", 20 * number + k, cache)
+    return _cases(TRAINING, 0, 20, cache)
 
 
 def more_cases(cache: Path) -> Iterator[Case]:
@@ -127,16 +132,12 @@ def more_cases(cache: Path) -> Iterator[Case]:
 
 def few_cases(cache: Path) -> Iterator[Case]:
     """Yield frames for training in which few caps are seen, as `FEW` says."""
-    for number, (condition, count) in enumerate(FEW.items()):
-        for k in range(count):
-            yield render(condition, "a", FEW_SEED + 50 * number + k, cache)
+    return _cases(FEW, FEW_SEED, 50, cache)
 
 
 def choosing_cases(cache: Path) -> Iterator[Case]:
     """Yield frames for choices of design: the family that was trained on, other seeds."""
-    for number, (condition, count) in enumerate(CHOOSING.items()):
-        for k in range(count):
-            yield render(condition, "a", CHOOSING_SEED + 5 * number + k, cache)
+    return _cases(CHOOSING, CHOOSING_SEED, 5, cache)
 
 
 def judging_cases(cache: Path, count: int = 3, tables: int = 1) -> Iterator[Case]:

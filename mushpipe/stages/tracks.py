@@ -43,9 +43,9 @@ class Tracks:
     """Assigns mushrooms to those seen before: least total distance, each within half a radius.
 
     Distances are taken in 3D, and in the image where a position is unknown; of two as far away the
-    one of about the same radius is nearer. When the camera moves
-    all mushrooms shift alike; that shift is what most pairs of old and new agree on. Where few are
-    found again, and those not where they were, all of them are new.
+    one of about the same radius is nearer. When the camera moves all mushrooms shift alike; that
+    shift is what most pairs of old and new agree on. Where few are found again, and those not where
+    they were, all of them are new.
     """
 
     def __init__(self) -> None:
