@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from mushpipe.core.document import Document, Location
 from mushpipe.core.errors import GraphError, PluginError, Problem, suggest
@@ -51,6 +51,13 @@ class GraphFile(BaseModel):
     source: dict[str, Any] = Field(description="where frames come from")
     stages: dict[str, dict[str, Any]] = Field({}, description="what happens to them, in order")
     sinks: dict[str, dict[str, Any]] = Field({}, description="where results go")
+
+    @field_validator("mushpipe", mode="before")
+    @classmethod
+    def _is_number(cls, value: Any) -> Any:
+        if isinstance(value, bool):  # YAML's yes, which equals 1
+            raise ValueError("Input should be 1")
+        return value
 
 
 def compile_document(

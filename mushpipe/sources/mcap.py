@@ -109,7 +109,7 @@ class McapSource(RecordedSource, ReplaySource):
         delivered = turn = shift = shift_ns = 0
         while turn < self.loop or self.loop == 0:
             first = last = None
-            player.camera, player.frames = camera, 0
+            player.calibration.camera, player.frames = camera, 0
             # mushpipe writes frames in order, whatever their stamps; ROS sorts by what it logged
             messages = reader.messages(player.wanted(), start_ns, end_ns, player.numbered)
             played = player.play(messages, hold=bool(player.beside))
@@ -167,10 +167,10 @@ def _watched(frames: Iterable[RgbdFrame], path: Path) -> Iterator[RgbdFrame]:
 
 def _first_camera(player: Player, reader: RecordingReader, start_ns: int) -> Camera | None:
     """Return the calibration in force at the start, which may be recorded after it."""
-    if player.topics.camera is None:
+    if player.calibration.topic is None:
         return None
-    topic = {player.topics.camera}
+    topic = {player.calibration.topic}
     before = reader.messages(topic, 0, start_ns + 1) if start_ns else ()
     first = next(iter(deque(before, maxlen=1)), None)
     first = first or next(reader.messages(topic), None)
-    return player.calibration(first) if first else None
+    return player.calibrate(first) if first else None

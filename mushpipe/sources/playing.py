@@ -6,7 +6,6 @@ import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Set
 from dataclasses import replace
-from types import EllipsisType
 from typing import Any, TypeVar
 
 from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoders
@@ -17,16 +16,11 @@ from mushpipe.core.errors import InputError
 from mushpipe.core.geometry import Camera
 from mushpipe.core.recording import CONVERT, ZSTD, Raw
 from mushpipe.core.types import Header, RgbdFrame
-from mushpipe.sources.images import (
-    decode_camera,
-    decode_color,
-    decode_depth,
-    distortion,
-    with_ros2_names,
-)
+from mushpipe.sources.calibration import Calibration, Recorded
+from mushpipe.sources.images import decode_color, decode_depth, with_ros2_names
 from mushpipe.sources.pairing import Pairing
 from mushpipe.sources.recorded import RecordedSource
-from mushpipe.sources.topics import Topics, is_beside, says_aligned
+from mushpipe.sources.topics import Topics, says_aligned
 
 T = TypeVar("T")
 logger = logging.getLogger("mushpipe")
@@ -39,7 +33,6 @@ _ALIGN = (
     "depth must be aligned to colour; record aligned_depth_to_color, or play without depth: "
     "--set source.use_depth=false"
 )
-_RECTIFIED = ("rect", "rectified")  # image_rect_color, as ROS has it; others say image_color_rect
 
 
 class Player:
@@ -54,7 +47,7 @@ class Player:
         counts: Where images without a partner and undecodable ones are counted.
 
     Attributes:
-        camera: The calibration in force.
+        calibration: That in force.
         error: The first message that could not be decoded, and why.
         frames: How many were made.
     """
@@ -70,25 +63,22 @@ class Player:
     ) -> None:
         self.settings = settings
         self.name = name
-        # Where a camera is given, that of the recording does not matter.
-        self.topics = topics if settings.camera is None else replace(topics, camera=None)
+        self.topics = topics
         self.beside = beside
         self.numbered = numbered
         self.counts = counts
-        self.camera: Camera | None = None
+        self.calibration = Calibration(settings, topics, self._warn)
         self.error = ""
         self.frames = 0
         self._first: tuple[int, ...] | None = None  # size of the first image
         self._size: tuple[int, ...] | None = None  # of the last
         self._factories = (ProtobufDecoders(), Ros2Decoders())
-        self._calibrated = ""  # frame of the calibration
-        self._stated = False  # whether there was a calibration, or word that there is none
         self._warned: set[str] = set()
         self._found_beside: dict[tuple[int, int], dict[str, wire.Message]] = {}
 
     def wanted(self) -> set[str]:
         """Return the topics of the messages that `play` takes."""
-        named = (self.topics.color, self.topics.depth, self.topics.camera)
+        named = (self.topics.color, self.topics.depth, self.calibration.topic)
         return {topic for topic in named if topic is not None} | self.beside
 
     def play(self, messages: Iterable[Raw], hold: bool) -> Iterator[RgbdFrame]:
@@ -122,8 +112,8 @@ class Player:
 
     def _take(self, raw: Raw, pairing: Pairing[_Color, _Depth]) -> Iterator[RgbdFrame]:
         number = raw.message.sequence if self.numbered else 0
-        if raw.channel.topic == self.topics.camera:
-            self.calibration(raw, "calibrations")
+        if raw.channel.topic == self.calibration.topic:
+            self.calibrate(raw, "calibrations")
         elif raw.channel.topic == self.topics.depth:
             depth = self._decode(raw, self._depth)
             if depth:
@@ -152,42 +142,18 @@ class Player:
             del self._found_beside[next(iter(self._found_beside))]
         return replace(frame, attached=attached) if attached else frame
 
-    def calibration(self, raw: Raw, what: str = "") -> Camera | None:
+    def calibrate(self, raw: Raw, what: str = "") -> Camera | None:
         """Decode a calibration, which holds from now on, also where it says that there is none.
 
         After one that cannot be decoded none is known; it is counted where ``what`` says as what.
         """
-        name = self.topics.color.split("/")
-        words = {word for part in name for word in part.split("_")}
-        rectified = not words.isdisjoint(_RECTIFIED)
 
-        def decode(message: Any, raw: Raw) -> Camera | None:
-            self._calibrated = _stamp(message, raw)[1]
-            if "image_rect_raw" in name and any(distortion(message)):
-                self._warn_rectified()  # realsense2_camera's name, also where it rectified nothing
-            camera = decode_camera(message, rectified)
-            if camera is not None and not camera.centred:
-                self._warn_off_centre(camera)
-            return camera
+        def read(message: Any, raw: Raw) -> Camera | None:
+            return self.calibration.read(message, _stamp(message, raw)[1])
 
-        self.camera, self._stated = self._decode(raw, decode, what), True
-        return self.camera
-
-    def _warn_rectified(self) -> None:
-        """Say that a lens is left out."""
-        self._warn(
-            f"{self.topics.color} is called rectified, so the distortion that its calibration "
-            "states is not applied; if the images are as the lens made them, positions near their "
-            "corners are off by some mm"
-        )
-
-    def _warn_off_centre(self, camera: Camera) -> None:
-        """Say that a calibration may be that of other images; of a part of one it may be right."""
-        self._warn(
-            f"the principal point of the calibration ({self.topics.camera}), ({camera.cx:g}, "
-            f"{camera.cy:g}), lies outside of the image, which is {camera.width}x{camera.height}; "
-            "if the images were made smaller, positions are off: set source.camera"
-        )
+        self.calibration.camera = self._decode(raw, read, what)
+        self.calibration.stated = True
+        return self.calibration.camera
 
     def _warn(self, text: str) -> None:
         """Say something once."""
@@ -223,9 +189,7 @@ class Player:
     def _color(self, message: Any, raw: Raw) -> _Color:
         stamp_ns, frame_id = _stamp(message, raw)
         header = Header(stamp_ns, raw.message.sequence, frame_id, raw.message.log_time)
-        # A calibration that changes holds from there on, not for images that wait for their depth;
-        # the first one does.
-        return header, decode_color(message), self.camera if self._stated else ...
+        return header, decode_color(message), self.calibration.recorded()
 
     def _depth(self, message: Any, raw: Raw) -> tuple[int, _Depth]:
         stated = raw.channel.metadata.get("depth_scale")
@@ -237,7 +201,7 @@ class Player:
         return (self._frame(color, depth) for color, depth in pairs)
 
     def _frame(self, color: _Color, depth: _Depth | None) -> RgbdFrame:
-        header, image, camera = color
+        header, image, recorded = color
         sequence = header.sequence if self.numbered else self.frames
         header = replace(header, sequence=sequence)
         self.frames += 1
@@ -251,31 +215,14 @@ class Player:
             (h, w), (high, wide) = depth[1].shape, image.shape[:2]
             sizes = f"depth ({self.topics.depth}) is {w}x{h}, colour {wide}x{high}"
             raise InputError(f"{self.name}, frame {sequence}: {sizes}: {_ALIGN}")
-        self._check_calibration(header.frame_id)
-        self._watch_size(image.shape[:2], sequence)
+        size = image.shape[:2]
+        self._watch_size(size, sequence)
         try:
             native, scale = depth[1:] if depth else (None, 0.001)
-            return RgbdFrame(header, image, native, scale, self._camera(image.shape[:2], camera))
-        except ValueError as error:
+            known = self.calibration.of_image(size, self._first or size, header.frame_id, recorded)
+            return RgbdFrame(header, image, native, scale, known)
+        except (ValueError, InputError) as error:
             raise InputError(f"{self.name}, frame {sequence}: {error}") from error
-
-    def _check_calibration(self, frame_id: str) -> None:
-        """Refuse the calibration of another camera, unless it was named or stands beside colour."""
-        topic = self.topics.camera
-        if topic is None or self.settings.camera_topic or is_beside(topic, self.topics.color):
-            return
-        if self._calibrated and frame_id and self._calibrated != frame_id:
-            raise InputError(
-                f"{self.name}: the only calibration ({topic}) is of frame '{self._calibrated}', "
-                f"colour is in '{frame_id}': name it if it holds for colour (--set "
-                f"source.camera_topic={topic}), or set source.camera: {{fx: , fy: , cx: , cy: }}"
-            )
-
-    def _camera(self, size: tuple[int, ...], recorded: _Calibration) -> Camera | None:
-        given = self.settings.camera
-        if given is None:
-            return self.camera if recorded is ... else recorded
-        return given.of_image(size, self._first or size)
 
     def _watch_size(self, size: tuple[int, ...], sequence: int) -> None:
         if self._size not in (None, size) and self._size:
@@ -284,8 +231,7 @@ class Player:
         self._first, self._size = self._first or size, size
 
 
-_Calibration = Camera | None | EllipsisType  # which is that nothing was stated yet
-_Color = tuple[Header, Any, _Calibration]
+_Color = tuple[Header, Any, Recorded]
 _Depth = tuple[str, Any, float]
 
 

@@ -68,7 +68,7 @@ def test_a_size_that_does_not_fit_the_calibration_ends_the_run(folder: Path) -> 
     record(folder / "a.mcap", [(120, 160), (100, 160)], True, CAMERA)
     done = mushpipe("run", "graph.yaml", "--source", "a.mcap", cwd=folder)
     assert done.returncode == EXIT_DAMAGED
-    assert "frame 1: the image is 160x100, its calibration is for 160x120" in done.stderr
+    assert "frame 1: the image (/camera/color/image_raw) is 160x100, its calibration" in done.stderr
     assert "1 frames in = 1 processed" in done.stderr
 
 

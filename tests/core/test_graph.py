@@ -95,6 +95,12 @@ FAULTS = {
                             ^
     did you mean 'level'?""",
     ),
+    "a version that only equals 1": (
+        "mushpipe: yes\nsource: {use: frames}\n",
+        """graph.yaml:1:11: mushpipe: Input should be 1, got true
+    mushpipe: yes
+              ^""",
+    ),
     "wrong type": (
         stage("{use: threshold, level: high}"),
         """graph.yaml:4:32: level of 'threshold': Input should be a valid integer, got "high"

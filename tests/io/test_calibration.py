@@ -214,7 +214,9 @@ def test_calibration_of_another_size_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError) as error:
         play(path)
     assert str(error.value) == (
-        f"{path}, frame 0: the image is 8x6, its calibration is for 640x480"
+        f"{path}, frame 0: the image ({COLOR}) is 8x6, its calibration ({COLOR_INFO}) for 640x480: "
+        "name that of these images (--set source.camera_topic=), or set source.camera: "
+        "{fx: , fy: , cx: , cy: }"
     )
     assert error.value.exit_code == 4
 
@@ -238,7 +240,7 @@ def test_a_change_of_size_that_the_calibration_does_not_follow_ends_the_playback
     source = McapSource(path=write_bag(tmp_path, [info_at(0), *shrinking()]))
     frames, error = drain(source)
     assert len(frames) == 1
-    assert "frame 1: the image is 4x3, its calibration is for 8x6" in str(error)
+    assert f"frame 1: the image ({COLOR}) is 4x3, its calibration ({COLOR_INFO}) for 8x6" in str(error)
 
 
 def test_a_change_of_size_that_the_calibration_follows_is_played(tmp_path: Path) -> None:
