@@ -45,12 +45,12 @@ def first(tmp_path: Path, entries: list[Entry], **settings: object) -> RgbdFrame
 
 
 def refusal(tmp_path: Path, entries: list[Entry], **settings: object) -> str:
-    """Return what is said about a recording, without the path and the frame that it begins with."""
+    """Return what is said about a recording, without the path that it begins with."""
     path = write_bag(tmp_path, entries)
     with pytest.raises(InputError) as error:
         play(path, **settings)
     assert error.value.exit_code == 4
-    return str(error.value).removeprefix(str(path)).removeprefix(", frame 0").removeprefix(": ")
+    return str(error.value).removeprefix(f"{path}: ")
 
 
 @pytest.mark.parametrize(
@@ -218,7 +218,7 @@ def test_the_calibration_of_another_camera_is_refused_unless_it_is_named(
 ) -> None:
     entries = [(topic, T0, camera_info(frame_id="cam2")), color_at(0)]
     text = refusal(tmp_path / "a", entries)
-    assert text.startswith(f"the only calibration ({topic}) is of frame 'cam2', colour is in")
+    assert f"the only calibration ({topic}) is of frame 'cam2', colour is in" in text
     assert first(tmp_path / "b", entries, camera_topic=topic).camera is not None
 
 
