@@ -10,14 +10,13 @@ from pathlib import Path
 
 from pydantic import Field, PrivateAttr
 
-from mushpipe.core import wire
 from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.geometry import Camera
 from mushpipe.core.paths import GraphPath
 from mushpipe.core.recording import GRAPH, MANIFEST, Index, RecordingReader
 from mushpipe.core.stage import ReplaySource
 from mushpipe.core.types import RgbdFrame
-from mushpipe.sources.playing import Player
+from mushpipe.sources.playing import Player, beside_of
 from mushpipe.sources.recorded import NO_CAMERA, NO_DEPTH, RecordedSource
 from mushpipe.sources.topics import Topics, choose_topics, untold_images
 
@@ -88,7 +87,7 @@ class McapSource(RecordedSource, ReplaySource):
         reader = self._reader or RecordingReader(self.path)
         index, topics = self._chosen(reader)
         numbered = MANIFEST in index.metadata or GRAPH in index.metadata
-        beside = _beside(index) if numbered else set()
+        beside = beside_of(index.channels) if numbered else set()
         if topics.depth is None:
             logger.warning(NO_DEPTH, self.path.name)
             if self.use_depth and (others := untold_images(index, topics.color)):
@@ -140,12 +139,6 @@ class McapSource(RecordedSource, ReplaySource):
             raise InputError(f"{self.path}: {'; '.join(faults)}; {delivered} frames could be read")
         if not delivered:
             raise InputError(f"{self.path}: there is no frame in the chosen range")
-
-
-def _beside(index: Index) -> set[str]:
-    """Return what else was recorded of the frames themselves: truth, clocks; but no results."""
-    images = {wire.COLOR_TOPIC, wire.DEPTH_TOPIC, wire.CAMERA_TOPIC}
-    return {t for t in index.channels.keys() - images if not t.startswith(wire.RESULT_PREFIX)}
 
 
 def _watched(frames: Iterable[RgbdFrame], path: Path) -> Iterator[RgbdFrame]:

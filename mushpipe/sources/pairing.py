@@ -65,7 +65,7 @@ class Pairing(Generic[C, D]):
     def _settle(self, last: bool) -> Iterator[tuple[C, D | None]]:
         while self._colors:
             stamp, number, color = self._colors[0]
-            while self._depths and self._depths[0][0] < stamp - self.tolerance_ns:
+            while self._depths and self._passed(self._depths[0], stamp, number):
                 self._depths.popleft()
                 self.depth_alone += 1
             near = [
@@ -73,7 +73,7 @@ class Pairing(Generic[C, D]):
             ]
             if not (last or self._impatient() or self._is_final(stamp, near)):
                 return
-            best = self._nearest(stamp, near)
+            best = self._nearest(stamp, number, near)
             self._colors.popleft()
             if best is None:
                 self.color_alone += 1
@@ -84,6 +84,11 @@ class Pairing(Generic[C, D]):
                 self.depth_alone += 1
             yield color, self._depths.popleft()[2]
 
+    def _passed(self, depth: tuple[int, int, D], stamp: int, number: int) -> bool:
+        """Whether a depth item came before the first colour item, and is none of it."""
+        before = depth[0] < stamp and depth[1] < number
+        return before or depth[0] < stamp - self.tolerance_ns
+
     def _is_final(self, stamp: int, near: list[tuple[int, int, D]]) -> bool:
         """Whether nothing that is still to come can change the partner of the first colour."""
         if any(d[0] == stamp for d in near):
@@ -92,9 +97,12 @@ class Pairing(Generic[C, D]):
             return len(self._colors) > 1  # a later depth may belong to the next colour
         return len(self._depths) > len(near)
 
-    def _nearest(self, stamp: int, near: list[tuple[int, int, D]]) -> tuple[int, int, D] | None:
-        """Return the nearest depth item that is not nearer to the next colour item."""
-        after = self._colors[1][0] if len(self._colors) > 1 else None
+    def _nearest(
+        self, stamp: int, number: int, near: list[tuple[int, int, D]]
+    ) -> tuple[int, int, D] | None:
+        """Return the nearest depth item that is not nearer to the next colour of its number."""
+        follows = len(self._colors) > 1 and self._colors[1][1] == number
+        after = self._colors[1][0] if follows else None
         free = [d for d in near if after is None or abs(d[0] - stamp) <= abs(d[0] - after)]
         return min(free, key=lambda d: abs(d[0] - stamp), default=None)
 

@@ -235,6 +235,12 @@ _Color = tuple[Header, Any, Recorded]
 _Depth = tuple[str, Any, float]
 
 
+def beside_of(topics: Iterable[str]) -> set[str]:
+    """Return which topics are of the frames themselves, as truth and clocks, but no images."""
+    images = {wire.COLOR_TOPIC, wire.DEPTH_TOPIC, wire.CAMERA_TOPIC}
+    return {t for t in set(topics) - images if not t.startswith(wire.RESULT_PREFIX)}
+
+
 def _stamp(message: Any, raw: Raw) -> tuple[int, str]:
     """Return sensor time and frame; a stamp that was never set gives way to the publish time."""
     if hasattr(message, "header"):

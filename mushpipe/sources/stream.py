@@ -9,7 +9,7 @@ import select
 import stat
 import threading
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from io import BufferedReader, RawIOBase
 from itertools import chain, islice
@@ -24,7 +24,8 @@ from mushpipe.core import wire
 from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.recording import GARBAGE, MANIFEST, Raw
 from mushpipe.core.types import RgbdFrame
-from mushpipe.sources.playing import Player
+from mushpipe.sources.pairing import Pairing
+from mushpipe.sources.playing import Player, beside_of
 from mushpipe.sources.recorded import NO_CAMERA, NO_DEPTH, RecordedSource
 from mushpipe.sources.topics import Topics
 
@@ -111,23 +112,17 @@ class StreamSource(RecordedSource):
             self.camera_topic or wire.CAMERA_TOPIC,
         )
         reader = _Messages(self._records)
-        messages, head, size = iter(reader), list[Raw](), 0
-        for raw in messages:
-            head.append(raw)
-            size += len(raw.message.data)
-            colored = _count(head, topics.color)
-            if raw.channel.topic == topics.depth or colored == 2:
-                break
-            if not colored and size > _MOST_BEFORE:
-                raise InputError(self._nothing_on(topics.color, reader))
+        messages = iter(reader)
+        head = self._head(messages, reader, topics)
+        first = topics
         if topics.depth not in {raw.channel.topic for raw in head}:
-            topics = replace(topics, depth=None)
+            first = replace(topics, depth=None)
             if head:
                 logger.warning(NO_DEPTH, "the stream")
-        beside = reader.topics - set(vars(topics).values()) if self._manifest else set()
-        player = Player(self, "the stream", topics, beside, bool(self._manifest), self._counts)
-        wanted = player.wanted()
-        known = (raw for raw in chain(head, messages) if raw.channel.topic in wanted)
+        others = reader.topics - set(vars(topics).values())
+        beside = beside_of(others) if self._manifest else set()
+        player = Player(self, "the stream", first, beside, bool(self._manifest), self._counts)
+        known = _of_interest(chain(head, messages), player, topics)
         for frame in player.play(known, hold=False):
             if frame.camera is None and player.frames == 1:
                 why = f" ({player.error})" if player.error else ""
@@ -140,6 +135,24 @@ class StreamSource(RecordedSource):
             raise InputError(f"the stream {damage}; {player.frames} frames came")
         if not player.frames:
             raise InputError(self._nothing_on(topics.color, reader))
+
+    def _head(self, messages: Iterator[Raw], reader: _Messages, topics: Topics) -> list[Raw]:
+        """Return the messages up to the first depth, or up to where there seems to be none.
+
+        A recording that is sent can wait as long as its images would for their depth; the images
+        of a camera would grow old.
+        """
+        head, size = list[Raw](), 0
+        most = 2 if self.live else Pairing.PATIENCE + 1
+        for raw in messages:
+            head.append(raw)
+            size += len(raw.message.data)
+            colored = _count(head, topics.color)
+            if raw.channel.topic == topics.depth or colored == (most if topics.depth else 2):
+                break
+            if not colored and size > _MOST_BEFORE:
+                raise InputError(self._nothing_on(topics.color, reader))
+        return head
 
     def _behind(self) -> str:
         """Return what is amiss if something follows the end of the recording."""
@@ -156,6 +169,18 @@ class StreamSource(RecordedSource):
 
 def _count(messages: list[Raw], topic: str) -> int:
     return sum(raw.channel.topic == topic for raw in messages)
+
+
+def _of_interest(messages: Iterable[Raw], player: Player, topics: Topics) -> Iterator[Raw]:
+    """Yield what a player wants; depth that begins later than colour counts from there on."""
+    wanted = player.wanted()
+    for raw in messages:
+        if raw.channel.topic == topics.depth and player.topics.depth is None:
+            logger.info("the stream has depth from frame %d on", player.frames)
+            player.topics = topics
+            wanted = player.wanted()
+        if raw.channel.topic in wanted:
+            yield raw
 
 
 class _Messages:

@@ -244,6 +244,26 @@ def test_no_pair_is_further_apart_than_the_tolerance(
     assert [color for color, _ in pairs] == [stamp for is_color, stamp in items if is_color]
 
 
+few = st.sets(st.integers(0, 59), max_size=6)
+
+
+@given(lost_colors=few, lost_depths=few, tolerance=st.integers(0, 100), late=st.integers(0, 9))
+def test_of_numbered_items_none_lost_costs_another_its_partner(
+    lost_colors: set[int], lost_depths: set[int], tolerance: int, late: int
+) -> None:
+    """However close frames follow one another."""
+    pairing: Pairing[int, int] = Pairing(max(tolerance, late))
+    pairs = []
+    for number in range(60):
+        if number not in lost_colors:
+            pairs += pairing.add_color(11 * number, number, number)
+        if number not in lost_depths:
+            pairs += pairing.add_depth(11 * number + late, number, number)
+    pairs += pairing.finish()
+    kept = [number for number in range(60) if number not in lost_colors]
+    assert pairs == [(k, None if k in lost_depths else k) for k in kept]
+
+
 @pytest.mark.parametrize("lost", [None, "color", "depth"])
 @pytest.mark.parametrize("first", ["color", "depth"])
 def test_after_stamps_went_back_pairs_are_found_at_once(first: str, lost: str | None) -> None:

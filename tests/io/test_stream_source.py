@@ -26,6 +26,7 @@ from mushpipe.core.errors import (
 from mushpipe.core.paths import STDIO
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.recording import MANIFEST
+from mushpipe.core.wire import Message, Schema
 from mushpipe.sources import stream as module
 from mushpipe.sources.mcap import McapSource
 from mushpipe.sources.realsense_frames import Clock
@@ -34,14 +35,18 @@ from tests.cli.test_record import CAMERA, picture
 from tests.core.lab import Lab, held, soon
 
 
-def stream(path: Path, frames: int, live: bool = False, depth: bool = True) -> Path:
-    """Write what a sender sends into a file, which then stands in for standard input."""
+def stream(path: Path, frames: int, live: bool = False, depth: int = 0) -> Path:
+    """Write what a sender sends into a file, which then stands in for standard input.
+
+    There is depth from a frame on.
+    """
     manifest = {"json": '{"device": {"serial_number": "42"}}'} | ({"live": "true"} if live else {})
     writer = RecordingWriter(path, {MANIFEST: manifest})
     for i in range(frames):
         color, native = picture(i)
         header = Header(10**18 + i * 33_000_000, i + 7, "camera_color_optical_frame")
-        writer.frame(RgbdFrame(header, color, native if depth else None, 0.000125, CAMERA))
+        seen = native if depth <= i else None
+        writer.frame(RgbdFrame(header, color, seen, 0.000125, CAMERA))
     writer.close()
     return path
 
@@ -108,9 +113,39 @@ def test_of_a_camera_the_newest_frame_is_taken_of_a_recording_every_one(
 def test_a_stream_of_colour_alone_does_not_wait_for_depth(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    frames = list(opened(stream(tmp_path / "s.mcap", 3, depth=False)).frames())
+    frames = list(opened(stream(tmp_path / "s.mcap", 3, depth=3)).frames())
     assert [frame.depth for frame in frames] == [None] * 3
     assert "the stream has no depth" in caplog.text
+
+
+@pytest.mark.parametrize("depth", [1, 5, 31])
+def test_a_recording_that_is_sent_is_played_as_the_file_is(tmp_path: Path, depth: int) -> None:
+    """Also where depth begins later than colour."""
+    path = stream(tmp_path / "s.mcap", 40, depth=depth)
+    seen = [frame.depth is not None for frame in opened(path).frames()]
+    assert seen == [frame.depth is not None for frame in McapSource(path=path).frames()]
+    assert seen == [False] * depth + [True] * (40 - depth)
+
+
+def test_depth_of_a_camera_that_begins_late_counts_from_there_on(tmp_path: Path) -> None:
+    source = source_of(stream(tmp_path / "s.mcap", 9, live=True, depth=4), piped=True)()
+    source.open()
+    assert [frame.depth is not None for frame in source.frames()] == [False] * 5 + [True] * 4
+    assert source.counts() == {"depth images without colour": 1}
+
+
+def test_results_in_a_stream_are_not_passed_on(tmp_path: Path) -> None:
+    writer = RecordingWriter(tmp_path / "s.mcap", {MANIFEST: {"json": "{}"}})
+    for i in range(3):
+        color, native = picture(i)
+        header = Header(i + 1, i, "c")
+        writer.frame(RgbdFrame(header, color, native, 0.000125, CAMERA))
+        for topic in ("/mushpipe/found", "/truth/caps"):
+            writer.write(topic, Message("", Schema("text", "", b"", "json"), b"{}"), header)
+    writer.close()
+    for source in (opened(tmp_path / "s.mcap"), McapSource(path=tmp_path / "s.mcap")):
+        found = {topic for frame in source.frames() for topic in frame.attached}
+        assert "/mushpipe/found" not in found
 
 
 def test_a_stream_without_calibration_says_so_once(
