@@ -15,7 +15,8 @@ from mushpipe.core.jit import jit
 from mushpipe.core.types import end_of_scale
 
 SIGMAS = 4.0  # of depth noise, which the gate lets pass
-PAUSE_NS = 1_000_000_000  # what was seen longer ago is no part of what is seen now
+# What was seen longer ago is no part of what is seen now: robots are told the age of the frame.
+LONGEST_NS = 500_000_000
 
 
 class Memory(NamedTuple):
@@ -58,8 +59,9 @@ class FuseDepth(Stage):
 
     A pixel whose depth leaves its mean by more than the gate starts anew: it sees another surface
     now. The gate widens with depth, as noise does. A pixel without depth keeps its mean until it
-    has been without for `frames` frames. Where more pixels start anew than noise explains, the
-    camera moved, and the frame passes as it is; so it does after a pause, and where stamps go back.
+    has been without for `frames` frames or half a second. Where more pixels start anew than noise
+    explains, the camera moved, and the frame passes as it is; so it does after half a second
+    without a frame, and where stamps go back.
     """
 
     frames: int = Field(5, ge=1, le=100, description="frames that are averaged")
@@ -79,14 +81,14 @@ class FuseDepth(Stage):
 
     _memory: Memory | None = PrivateAttr(None)
     _scale: float = PrivateAttr(0.0)
-    _stamp_ns: int = PrivateAttr(0)
+    _stamps_ns: tuple[int, ...] = PrivateAttr(())  # of the last frames, the newest first
 
     def open(self) -> None:
         """Compile the kernel and forget what was seen."""
         for dtype in (np.uint16, np.float32):
             depth = np.ones((2, 2), dtype)
             depth.flags.writeable = False
-            fuse(depth, nothing(depth.shape), Gate(1.0, 0.0, 0.0, 9.0), 2)
+            fuse(depth, nothing(depth.shape), Gate(1.0, 0.0, 0.0, 9.0), 2, 0)
         self._memory = None
 
     def process(self, frame: RgbdFrame) -> RgbdFrame:
@@ -97,23 +99,24 @@ class FuseDepth(Stage):
         if depth.dtype == np.float32:
             depth = np.nan_to_num(depth, posinf=0.0, neginf=0.0)
             depth.flags.writeable = False
-        memory = self._memory
+        memory, now_ns = self._memory, frame.header.stamp_ns
         if (
             memory is None
             or memory.mean.shape != depth.shape
             or self._scale != frame.depth_scale
-            or not 0 <= frame.header.stamp_ns - self._stamp_ns <= PAUSE_NS
+            or not all(0 <= now_ns - stamp <= LONGEST_NS for stamp in self._stamps_ns[:1])
         ):
             memory = self._forget(frame)
-        self._stamp_ns = frame.header.stamp_ns
+        held = sum(now_ns - stamp <= LONGEST_NS for stamp in self._stamps_ns)
+        self._stamps_ns = (now_ns, *self._stamps_ns)[: self.frames - 1]
         noise = SIGMAS * self.depth_noise_mm / 1000 / frame.depth_scale
         growth = SIGMAS * self.depth_noise_per_m / 1000
         end = float(end_of_scale(depth))
         gate = Gate(self.gate_mm / 1000 / frame.depth_scale, noise, growth, end)
-        fresh, known = fuse(depth, memory, gate, self.frames)
+        fresh, known = fuse(depth, memory, gate, self.frames, held)
         if fresh > self.moved * known:
             memory = self._forget(frame)
-            fuse(depth, memory, gate, self.frames)
+            fuse(depth, memory, gate, self.frames, 0)
         return replace(frame, depth=np.array(memory.mean))
 
     def _forget(self, frame: RgbdFrame) -> Memory:
@@ -123,7 +126,9 @@ class FuseDepth(Stage):
 
 
 @jit
-def fuse(depth: NDArray[Any], memory: Memory, gate: Gate, frames: int) -> tuple[int, int]:
+def fuse(
+    depth: NDArray[Any], memory: Memory, gate: Gate, frames: int, longest: int
+) -> tuple[int, int]:
     """Take one more depth image into a mean.
 
     Args:
@@ -131,6 +136,7 @@ def fuse(depth: NDArray[Any], memory: Memory, gate: Gate, frames: int) -> tuple[
         memory: In and out.
         gate: What is mixed with it.
         frames: Most frames that a mean holds.
+        longest: How many frames without depth a mean outlasts.
 
     Returns:
         How many pixels started anew, and how many had depth before and have it now.
@@ -142,7 +148,7 @@ def fuse(depth: NDArray[Any], memory: Memory, gate: Gate, frames: int) -> tuple[
             if z <= 0 or z >= gate.end:
                 if mean[v, u] > 0:
                     age[v, u] += 1
-                    if age[v, u] >= frames:
+                    if age[v, u] > longest:
                         mean[v, u], held[v, u] = 0, 0
                 continue
             age[v, u] = 0
