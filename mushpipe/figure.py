@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import islice
 from string import ascii_lowercase
@@ -46,7 +46,7 @@ def draw_stages(trace: Trace) -> Figure:
     """
     color, circles = trace.frame.color, _last(trace, Circles)
     panels = [Panel("original", color)]
-    masks = dict(_named(trace, Mask))
+    masks = dict(trace.of(Mask))
     first = next(iter(masks.values()), None)
     if first is not None and first.initial is not None:
         initial = first.initial
@@ -120,7 +120,7 @@ def draw_pose(trace: Trace, settings: Mapping[str, Any]) -> Figure:
     stage = Registration.model_validate(dict(settings))
     best = np.argsort(-circles.score, kind="stable")
     # the frame that the stage got, where the recording has it: its depth may have been corrected
-    frame = ([trace.frame] + [value for _, value in _named(trace, RgbdFrame)])[-1]
+    frame = ([trace.frame] + [value for _, value in trace.of(RgbdFrame)])[-1]
     tries = (stage.align(frame, circles, locations, int(row), 0) for row in best)
     pairs = zip(best, tries, strict=True)
     found = list(islice((pair for pair in pairs if pair[1] is not None), POSES))
@@ -136,15 +136,8 @@ KINDS: dict[str, Callable[[Trace], Figure]] = {
 }
 
 
-def _named(trace: Trace, kind: type[T]) -> Iterator[tuple[str, T]]:
-    for stage, values in trace.outputs.items():
-        for value in values:
-            if isinstance(value, kind):
-                yield stage, value
-
-
 def _last(trace: Trace, kind: type[T]) -> T:
-    found = [value for _, value in _named(trace, kind)]
+    found = [value for _, value in trace.of(kind)]
     if not found:
         raise UsageError(
             f"frame {trace.frame.header.sequence} has no {kind.__name__}: the graph that wrote the "

@@ -134,9 +134,9 @@ def _play(file: Path, played: dict[str, Any], sink: RerunSink, stop: threading.E
 
     report, traces = RunReport(), read_traces(file, played)
     first = next(traces, None)  # what has none fails here, before an .rrd is emptied for it
-    sink.open(RunInfo(file.stem, read_manifest(file)))
     with progress_bar() as show:
         try:
+            sink.open(RunInfo(file.stem, read_manifest(file)))
             for trace in chain([first] if first else [], traces):
                 if stop.is_set():
                     raise typer.Exit(EXIT_INTERRUPTED)
@@ -144,6 +144,6 @@ def _play(file: Path, played: dict[str, Any], sink: RerunSink, stop: threading.E
                 report.processed += 1
                 if show is not None:
                     show(report)
-        except BaseException:  # what could be read is shown all the same
+        except BaseException:  # what could be read is shown all the same, and no viewer stays
             sink.close()
             raise

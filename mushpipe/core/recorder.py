@@ -214,5 +214,6 @@ def _standard_output() -> FileIO:
     sys.stdout.flush()
     number = sys.stdout.fileno()
     stream = FileIO(os.dup(number), "wb")
+    os.set_blocking(stream.fileno(), True)  # else nothing is written where a pipe is full
     os.dup2(sys.stderr.fileno(), number)
     return stream

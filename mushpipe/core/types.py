@@ -6,18 +6,20 @@ Frozen dataclasses, checked and locked on construction. The per-mushroom types s
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property, partial
 from numbers import Real
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.arrays import Bools, Bytes, Singles, locked
 from mushpipe.core.geometry import Camera
+
+T = TypeVar("T")
 
 _FARTHEST_M = 1e5  # the largest number of millimetres that is taken for metres is less
 _LATEST_NS = 2**32 * 10**9 - 1  # seconds are recorded in 32 bits
@@ -201,6 +203,13 @@ class Trace:
     def __post_init__(self) -> None:
         for name in ("outputs", "durations_ns"):  # other sinks see the same
             object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+
+    def of(self, kind: type[T]) -> Iterator[tuple[str, T]]:
+        """Yield stage and value of each output of a type, in the order of the graph."""
+        for stage, values in self.outputs.items():
+            for value in values:
+                if isinstance(value, kind):
+                    yield stage, value
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how to make it anew: what is read-only cannot be pickled."""

@@ -132,10 +132,9 @@ def events_of(verdicts: Sequence[Verdict], up: Sequence[float] = UP) -> Events:
     """
     direction = np.asarray(up, float) / np.linalg.norm(up)
     parts = [_frame(unit, verdict, direction) for unit, verdict in enumerate(verdicts)]
-    names = [item.name for item in fields(Events)]
     if not parts:
-        shapes = {item.name: item.metadata["shape"] for item in fields(Events)}
-        return Events(**{name: np.empty((0, *shapes[name])) for name in names})
+        return Events.unknown(0)
+    names = [item.name for item in fields(Events)]
     return Events(**{name: np.concatenate([part[name] for part in parts]) for name in names})
 
 

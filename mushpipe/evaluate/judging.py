@@ -10,7 +10,7 @@ from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.manifest import sha256
 from mushpipe.evaluate.events import UP, Events, Verdict, comparable, events_of, judge
 from mushpipe.evaluate.metrics import Value, measure
-from mushpipe.evaluate.results import Results, none_found
+from mushpipe.evaluate.results import Detections, Results
 from mushpipe.evaluate.truth import Place, TruthSet, has_truth, read_truth
 from mushpipe.traces import source_recording
 
@@ -159,7 +159,9 @@ def judge_results(
         judged.notes.append(f"{len(unanswered)} frames have no answer: all in them is missed")
     for place in unanswered:
         known = truth.frames[place]
-        judged.verdicts.append(judge(judged.name, place, known, None, none_found(), rules.iou))
+        judged.verdicts.append(
+            judge(judged.name, place, known, None, Detections.unknown(0), rules.iou)
+        )
     judged.verdicts.sort(key=lambda verdict: verdict.place)
     return judged
 

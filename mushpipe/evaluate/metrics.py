@@ -6,7 +6,7 @@ flipped axis shows as 180. `docs/evaluation.md` says it in full.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,8 +15,6 @@ from mushpipe.core.arrays import Floats, Ints
 from mushpipe.evaluate import statistics
 from mushpipe.evaluate.events import Events, Kind
 from mushpipe.evaluate.statistics import Statistic
-
-Quantities = Mapping[str, Floats]
 
 
 def angle_deg(a: Floats, b: Floats) -> Floats:

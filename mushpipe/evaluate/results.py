@@ -65,11 +65,6 @@ def of_circles(circles: Circles) -> Detections:
     return Detections.unknown(len(circles), **known)
 
 
-def none_found() -> Detections:
-    """Return the answer of a graph that found nothing."""
-    return Detections.unknown(0)
-
-
 @dataclass
 class Results:
     """A result recording.
@@ -201,7 +196,7 @@ def _decode(path: Path, raw: Raw) -> tuple[Header, Columns]:
 def _detections(table: Columns) -> Detections:
     if isinstance(table, Picks):
         return of_picks(table)
-    return of_circles(table) if isinstance(table, Circles) else none_found()
+    return of_circles(table) if isinstance(table, Circles) else Detections.unknown(0)
 
 
 def _add_durations(results: Results, raw: Raw) -> None:

@@ -70,8 +70,8 @@ class Placer:
         now = self._clock.monotonic()
         return now, self._clock.wall_ns() / 1e9 - now
 
-    def sample(self) -> float:
-        """Look at both clocks; return the monotonic time. To be called a few times a second."""
+    def _look(self) -> float:
+        """Look at both clocks; return the monotonic time."""
         now, offset = self._read()
         last = self._spans[-1]
         last.end = now
@@ -87,7 +87,7 @@ class Placer:
 
     def place(self, stamp_ns: int) -> float | None:
         """Return the monotonic time of a stamp; None for the future and the far past."""
-        now = self.sample()
+        now = self._look()
         placed = [span.place(stamp_ns / 1e9) for span in self._spans]
         found = [time_s for time_s in placed if time_s is not None]
         return min(now, *found) if found else None

@@ -247,6 +247,8 @@ def replay(
             as_client(lines, *_split(connect), show, hello)
         else:
             as_server(lines, listen or 0, show, listening)
+    except _NobodyReads as error:
+        raise BrokenPipeError from error
     except OSError as error:
         _note(f"{connect or 'the client'}: {error}")
         raise typer.Exit(1) from None

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from mushpipe.robot.clock import Clock
-from mushpipe.robot.messages import MAX_LINE, Refusal
+from mushpipe.robot.messages import CLIENT_TIMEOUT_S, MAX_LINE, Refusal
 from mushpipe.robot.session import Outgoing, Session
 
 BATCH = 16
@@ -35,7 +35,7 @@ class Limits:
 
     hello_s: float = 5.0
     line_s: float = 5.0
-    idle_s: float = 10.0
+    idle_s: float = CLIENT_TIMEOUT_S
     write_s: float = 2.0
     drain_s: float = 1.0
     lines_per_s: float = 200.0

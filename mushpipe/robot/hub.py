@@ -14,7 +14,7 @@ import orjson
 
 from mushpipe.robot.clock import Clock
 from mushpipe.robot.ledger import Ledger, Outcome
-from mushpipe.robot.messages import HEARTBEAT_S, PROTOCOL, VERSION, Refusal, State
+from mushpipe.robot.messages import CLIENT_TIMEOUT_S, HEARTBEAT_S, PROTOCOL, VERSION, Refusal, State
 from mushpipe.robot.targets import Choice, Reason, Target
 
 logger = logging.getLogger("mushpipe")
@@ -36,7 +36,6 @@ class Settings:
 
     max_age_s: float = 0.5
     stall_s: float = 1.0
-    client_timeout_s: float = 10.0
     claim_s: float = 60.0
     max_targets: int = 200
     replay: bool = False
@@ -155,7 +154,7 @@ class Hub:
             "frame": self.newest.choice.frame if self.newest else None,
             "max_age_ms": round(settings.max_age_s * 1000),
             "heartbeat_ms": round(HEARTBEAT_S * 1000),
-            "client_timeout_ms": round(settings.client_timeout_s * 1000),
+            "client_timeout_ms": round(CLIENT_TIMEOUT_S * 1000),
             "auth": "token" if settings.token else "none",
             **self.envelope(now),
         }

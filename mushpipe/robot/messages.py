@@ -15,6 +15,7 @@ VERSION = "1.0"
 MAX_LINE = 65_536
 NAME = r"^[A-Za-z0-9_.-]{0,64}$"
 HEARTBEAT_S = 1.0
+CLIENT_TIMEOUT_S = 10.0  # without a line
 LONGEST_HOLD_MS = 3_600_000
 
 

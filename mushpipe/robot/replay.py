@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 import socket
-import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -62,16 +62,18 @@ def as_client(
         OSError: The server cannot be reached, or ends the conversation with an error.
     """
     said = [line.text for line in lines if line.kind == "rx"]
-    with socket.create_connection((host, port), SILENCE_S) as sock:
-        sender = threading.Thread(target=_say, args=(sock, said, hello or {}, show), daemon=True)
-        sender.start()
+    with (
+        ThreadPoolExecutor(1) as sender,
+        socket.create_connection((host, port), SILENCE_S) as sock,
+    ):
+        saying = sender.submit(_say, sock, said, hello or {}, show)
         count, last = 0, b""
         with sock.makefile("rb") as answers:
             for answer in answers:
                 last = answer.rstrip(b"\n")
                 show("<", last)
                 count += 1
-        sender.join()
+        saying.result()
     if b'"fatal":true' in last:
         raise ConnectionError("the server ended the conversation: see its last line")
     return count
@@ -80,12 +82,14 @@ def as_client(
 def _say(sock: socket.socket, said: list[bytes], hello: Mapping[str, Any], show: Show) -> None:
     """Say everything; answers are read meanwhile, for a server does not wait with them."""
     with suppress(OSError):  # it has hung up; its last line says why
-        for text in said:
-            line = orjson.dumps({**orjson.loads(text), **hello}) if _is_hello(text) else text
-            show(">", text)
-            sock.sendall(line + b"\n")
-        # The server answers what it has got, then closes in its turn.
-        sock.shutdown(socket.SHUT_WR)
+        try:
+            for text in said:
+                line = orjson.dumps({**orjson.loads(text), **hello}) if _is_hello(text) else text
+                show(">", text)
+                sock.sendall(line + b"\n")
+        finally:
+            # The server answers what it has got, then closes in its turn.
+            sock.shutdown(socket.SHUT_WR)
 
 
 def _is_hello(line: bytes) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import selectors
 import socket
@@ -153,8 +154,10 @@ class RobotServer:
     def _accept(self, listening: socket.socket, listener: Listener) -> None:
         try:
             sock, address = listening.accept()
-        except OSError:
-            return  # it went away before we looked, or descriptors ran out: the others go on
+        except OSError as error:  # it went away before we looked: the others go on
+            if error.errno in (errno.EMFILE, errno.ENFILE):
+                time.sleep(THROTTLED_S)  # it stays ready, and select would return at once
+            return
         self._number += 1
         number = self._number
         try:

@@ -57,7 +57,12 @@ class FoxgloveSink(Sink):
         logger.info("Foxglove: open connection, Foxglove WebSocket, %s", address)
 
     def consume(self, trace: Trace) -> None:
-        """Send one frame to who is connected; without anybody this costs next to nothing."""
+        """Send one frame to who is connected; where nobody is, this costs nothing.
+
+        The first frame is made for nobody all the same: it tells the topics there are.
+        """
+        if self._channels and not any(channel.has_sinks() for channel in self._channels.values()):
+            return
         frame = trace.frame
         color = wire.encode_color(frame, self.jpeg_quality)
         self._send(trace, (wire.COLOR_TOPIC, color))

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import ByteSize, Field, PrivateAttr
 
 from mushpipe import RunInfo, Sink, SinkPath, Trace
+from mushpipe.core.errors import MushpipeError
 from mushpipe.core.paths import STDIO
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.recording import MANIFEST, SUMMARY
@@ -51,6 +52,7 @@ class McapSink(Sink):
     _run: RunInfo | None = PrivateAttr(None)
     _part: int = PrivateAttr(0)
     _writer: RecordingWriter | None = PrivateAttr(None)
+    _ended: MushpipeError | None = PrivateAttr(None)  # why no further part could be begun
     _unknown: set[type] = PrivateAttr(default_factory=set)
     _base: Transform | None = PrivateAttr(None)
 
@@ -69,7 +71,7 @@ class McapSink(Sink):
 
     def open(self, run: RunInfo) -> None:
         """Create the file and write the manifest; parts that a run before left go."""
-        self._run, self._part = run, 0
+        self._run, self._part, self._ended = run, 0, None
         if self.split_size is not None and self.path != STDIO and self.overwrite:
             path = run.path(self.path)
             for old in takewhile(Path.exists, (part(path, number) for number in count(1))):
@@ -102,6 +104,8 @@ class McapSink(Sink):
     def _next_writer(self) -> RecordingWriter:
         """Return the writer of the part in work, or of a new one where that has its size."""
         writer, run = self._writer, self._run
+        if self._ended is not None:
+            raise self._ended
         if writer is None or run is None:
             raise RuntimeError("the sink is not open")
         if self.split_size is None or self.path == STDIO or writer.size < self.split_size:
@@ -109,7 +113,11 @@ class McapSink(Sink):
         self._writer = None  # also where no new one can be begun
         writer.close()
         self._part += 1
-        self._writer = self._begin(run)
+        try:
+            self._writer = self._begin(run)
+        except MushpipeError as error:
+            self._ended = error
+            raise
         return self._writer
 
     def finish(self, summary: Mapping[str, Any]) -> None:

@@ -6,7 +6,7 @@ looks is told once, in `rerun_style`), and colours are packed as Rerun stores th
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -24,18 +24,10 @@ _FEW = 4  # px between those that a statistic is taken of
 FIRST = 20  # picks whose place in the order is written beside them
 
 
-def results(trace: Trace, kind: type) -> Iterator[tuple[str, Any]]:
-    """Yield stage and value of what the stages put out of one type."""
-    for stage in trace.outputs:
-        for value in trace.outputs[stage]:
-            if isinstance(value, kind) and value is not trace.frame:
-                yield stage, value
-
-
 def masks(trace: Trace) -> dict[str, Bools]:
     """Return masks by entity: each stage's, and each contour that one started from, once."""
     layers: dict[str, Bools] = {}
-    for stage, mask in results(trace, Mask):
+    for stage, mask in trace.of(Mask):
         known = any(mask.initial is layer for layer in layers.values())
         if mask.initial is not None and not known:
             same = (np.array_equal(mask.initial, layer) for layer in layers.values())
@@ -50,7 +42,7 @@ def changed(trace: Trace) -> dict[str, RgbdFrame]:
     color = trace.frame.color
     return {
         f"{at.FRAMES}/{stage}": frame
-        for stage, frame in results(trace, RgbdFrame)
+        for stage, frame in trace.of(RgbdFrame)
         if frame.color is not color and stage in trace.durations_ns
     }
 
@@ -64,8 +56,8 @@ def distance_of(frame: RgbdFrame) -> float | None:
 
 def layers_of(trace: Trace) -> list[str]:
     """Return the layers of the image that this frame has, in drawing order."""
-    circles = [f"{at.CIRCLES}/{stage}" for stage, _ in results(trace, Circles)]
-    picks = [at.PICKS, at.IDS] if any(results(trace, Picks)) else []
+    circles = [f"{at.CIRCLES}/{stage}" for stage, _ in trace.of(Circles)]
+    picks = [at.PICKS, at.IDS] if any(trace.of(Picks)) else []
     return [*changed(trace), *masks(trace), *circles, *picks]
 
 
@@ -136,11 +128,11 @@ def _rays(camera: Camera, step: int) -> Singles:
 
 def log_results(rec: Any, trace: Trace, base: Transform | None, stages: Sequence[str]) -> None:
     """Log circles, picks in the image and in space, counts, times, and the frame's warnings."""
-    for stage, circles in results(trace, Circles):
+    for stage, circles in trace.of(Circles):
         rec.log(f"{at.CIRCLES}/{stage}", _rings(circles))
     if trace.durations_ns:
         _log_series(rec, at.TIMES, stages, {n: t / 1e6 for n, t in trace.durations_ns.items()})
-    picks = next((value for _, value in reversed([*results(trace, Picks)])), None)
+    picks = next((value for _, value in reversed([*trace.of(Picks)])), None)
     if picks is not None:
         _log_picks(rec, picks)
         if picks.frame_id in ("", trace.frame.header.frame_id):

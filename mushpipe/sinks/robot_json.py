@@ -229,10 +229,10 @@ class RobotJsonSink(Sink):
         if placed is None:
             self._warn("the camera's time stamps are not of this host: robots get nothing")
             return -inf
-        if not shared:
-            played -= late
-            if self.max_age_ms < 1000 * late < inf:
-                self._warn("frames come later than the quickest did, by more than 'max_age_ms'")
+        if not shared or late < inf:
+            played -= late  # also where a stamp can be placed: the clock it is of may run ahead
+        if not shared and self.max_age_ms < 1000 * late < inf:
+            self._warn("frames come later than the quickest did, by more than 'max_age_ms'")
         return min(placed, played) - self.sensor_latency_ms / 1000
 
     def _warn(self, text: str) -> None:

@@ -15,6 +15,7 @@ _ONE_CHAIN = (
 # away. Neighbours are apart by two where they touch.
 _LOCATION_WITHIN = 1.0
 _POSE_WITHIN = 3.0
+_ROUNDING = 1e-6  # px: to space and back
 
 
 def require_same_rows(
@@ -39,7 +40,7 @@ def require_same_rows(
 
 def _require_near(circles: Circles, seen: Floats, what: str, within: float) -> None:
     """Raise ValueError where what is seen (N, 2), px, is farther than so many radii away."""
-    away = np.linalg.norm(seen - circles.center, axis=1) > within * circles.radius
+    away = np.linalg.norm(seen - circles.center, axis=1) > within * circles.radius + _ROUNDING
     if away.any():
         row = int(np.flatnonzero(away)[0])
         (u, v), (x, y) = circles.center[row], seen[row]

@@ -148,6 +148,22 @@ def test_a_full_disk_ends_the_recording_with_what_fits(scene: Path, tmp_path: Pa
     assert not (tmp_path / "failures").exists()
 
 
+def test_a_pipe_that_is_set_not_to_block_loses_nothing(scene: Path, tmp_path: Path) -> None:
+    """As a parent that shares it may have set it."""
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    command = [*MAIN, "record", "--source", str(scene), "-o", "-"]
+    with subprocess.Popen(command, stdout=writing, stderr=subprocess.PIPE, text=True) as sender:
+        os.close(writing)
+        with os.fdopen(reading, "rb") as pipe:
+            (tmp_path / "sent.mcap").write_bytes(pipe.read())
+        assert sender.stderr is not None
+        assert "Traceback" not in sender.stderr.read()
+    assert sender.returncode == 0
+    frames, damage = played(tmp_path / "sent.mcap")
+    assert ([frame.header.sequence for frame in frames], damage) == (list(range(IMAGES)), "")
+
+
 # A camera that does not wait for anybody; it tells when it has shown all it has.
 CAMERA_PY = """\
 from collections.abc import Iterator

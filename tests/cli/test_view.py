@@ -8,9 +8,10 @@ import pytest
 from rerun.chunk import RrdReader
 from typer.testing import CliRunner
 
-from mushpipe import Trace
+from mushpipe import RunInfo, Trace
 from mushpipe.cli import app
 from mushpipe.core.errors import DependencyError, GraphError, InputError, UsageError
+from mushpipe.sinks.rerun import RerunSink
 from tests.io.bags import COLOR, color_at, rgbd, write_bag
 from tests.io.values import make_circles, make_frame, make_picks, record, trace_of
 
@@ -115,3 +116,20 @@ def test_a_file_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     folder.mkdir()
     result = CliRunner().invoke(app, ["view", str(recording), "--save", str(folder)])
     assert str(result.exception) == f"save: {folder} cannot be written: Is a directory"
+
+
+def test_a_server_does_not_outlive_a_view_that_cannot_begin(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = record(tmp_path / "bed.mcap", [Trace(make_frame(), {}, {})])
+    events = list[str]()
+
+    def refuse(sink: RerunSink, run: RunInfo) -> None:
+        events.append("served")
+        raise UsageError("it cannot be written")
+
+    monkeypatch.setattr(RerunSink, "open", refuse)
+    monkeypatch.setattr(RerunSink, "close", lambda sink: events.append("closed"))
+    result = CliRunner().invoke(app, ["view", str(recording), "--save", "a.rrd", "--serve", "9871"])
+    assert isinstance(result.exception, UsageError)
+    assert events == ["served", "closed"]

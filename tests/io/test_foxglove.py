@@ -18,10 +18,11 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 from websockets.sync.client import ClientConnection, connect
 
-from mushpipe import PickFlag, Picks, RunInfo, Trace
+from mushpipe import PickFlag, Picks, RgbdFrame, RunInfo, Trace
 from mushpipe.cli import app
 from mushpipe.core import wire
 from mushpipe.core.errors import UsageError
+from mushpipe.sinks import foxglove as module
 from mushpipe.sinks.foxglove import FoxgloveSink
 from tests.io.values import make_circles, make_frame, make_picks, no_picks, record, trace_of
 
@@ -175,6 +176,22 @@ def test_a_client_of_the_websocket_protocol_gets_frames_and_picks() -> None:
     finally:
         sink.close()
         sink.close()
+
+
+def test_frames_that_nobody_asked_for_are_not_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    sink, made = FoxgloveSink(port=0), list[str]()
+    sink.open(RunInfo("bed", {}))
+    encode_color = module.wire.encode_color
+
+    def counted(frame: RgbdFrame, jpeg_quality: int | None) -> wire.Message:
+        made.append("color")
+        return encode_color(frame, jpeg_quality)
+
+    monkeypatch.setattr(module.wire, "encode_color", counted)
+    for _ in range(5):
+        sink.consume(trace_of(make_frame(), pick=make_picks()))
+    assert made == ["color"]
+    sink.close()
 
 
 def test_it_listens_on_this_machine_only_and_a_taken_port_is_named() -> None:

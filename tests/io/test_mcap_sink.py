@@ -18,6 +18,7 @@ from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory
 
 from mushpipe import Header, Mask, RunInfo
+from mushpipe.core.errors import UsageError
 from mushpipe.sinks.mcap import McapSink
 from mushpipe.traces import read_traces
 from tests.io.bags import FX, FY, OPTICAL, PERIOD, T0, color_pixels, depth_pixels
@@ -280,6 +281,16 @@ def test_viewers_are_told_where_the_camera_is_in_the_robots_frame(tmp_path: Path
     assert [rotation.x, rotation.y, rotation.z, rotation.w] == base["quaternion"]
     (trace,) = read_traces(tmp_path / "a.mcap")
     assert set(trace.outputs) == {"pick"}
+
+
+def test_a_part_that_cannot_be_begun_is_why_nothing_more_is_recorded(tmp_path: Path) -> None:
+    (tmp_path / "row_001.mcap").write_bytes(b"another recording")
+    sink = McapSink(path=tmp_path / "row.mcap", split_size=1, overwrite=False)
+    sink.open(RunInfo("", {}))
+    for number in (0, 1, 2):
+        with pytest.raises(UsageError, match=r"row_001\.mcap exists"):
+            sink.consume(trace_of(make_frame(number)))
+    sink.close()
 
 
 def test_a_shorter_run_leaves_no_parts_of_the_one_before_and_touches_nothing_else(

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import socket
 import ssl
 import struct
+import time
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from mushpipe.robot.connection import Limits
 from mushpipe.robot.messages import MAX_LINE
+from mushpipe.robot.server import THROTTLED_S
 from tests.robot.peer import Peer, read_line
 from tests.robot.scene import bench, choice
 
@@ -228,6 +233,25 @@ def test_a_fault_of_ours_costs_one_client(monkeypatch: pytest.MonkeyPatch) -> No
         assert one.rest() == []
         b.publish()
         assert two.wait("targets")["seq"] == 1
+
+
+def test_without_a_free_descriptor_the_server_does_not_spin(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tries = []
+    with bench() as b, Peer(b.port) as peer:
+        peer.greet()
+
+        def full(self: socket.socket) -> tuple[socket.socket, Any]:
+            tries.append(time.monotonic())
+            raise OSError(errno.EMFILE, "Too many open files")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(socket.socket, "accept", full)
+            with socket.create_connection(("127.0.0.1", b.port)):
+                while len(tries) < 20:
+                    assert peer.ask("ping", id=len(tries))["op"] == "pong"
+        assert min(later - early for early, later in pairwise(tries)) >= THROTTLED_S
 
 
 def test_a_dead_server_is_not_believed_alive(monkeypatch: pytest.MonkeyPatch) -> None:

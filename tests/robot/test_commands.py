@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import socket
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from mushpipe.core.errors import EXIT_USAGE, InputError
 from mushpipe.robot import commands
 from mushpipe.robot.client import RobotClient
 from mushpipe.robot.replay import as_server, lines_of
+from tests.cli.shell import MAIN
 from tests.robot.scene import bench
 from tests.robot.test_transcript import record
 
@@ -89,6 +91,21 @@ def test_a_transcript_is_replayed(tmp_path: Path) -> None:
         assert '"effect":"removed"' in done.output
     assert robot("replay", path, "--connect", f"127.0.0.1:{b.port}").exit_code == 1
     assert robot("replay", path).exit_code == 2
+
+
+def test_a_transcript_whose_replay_nobody_reads_any_more_ends_quietly(tmp_path: Path) -> None:
+    path = tmp_path / "robot.mcap"
+    record(path)
+    with bench() as b:
+        b.publish()
+        for lines in ("0", "1", "3"):
+            words = [*MAIN, "robot", "replay", str(path), "--connect", f"127.0.0.1:{b.port}"]
+            done = subprocess.run(
+                f"{shlex.join(words)} | head -n {lines}",
+                shell=True, capture_output=True, text=True, check=False,
+            )  # fmt: skip
+            assert "Traceback" not in done.stderr
+            assert "NobodyReads" not in done.stderr
 
 
 def test_a_recording_is_replayed_to_nobody_who_does_not_accept_it(tmp_path: Path) -> None:

@@ -316,6 +316,22 @@ def test_what_a_frame_waits_in_a_stream_counts_once(sink: RobotJsonSink) -> None
     assert found[1:] == pytest.approx([0, 100, 300], abs=2)
 
 
+@pytest.mark.parametrize("ahead_s", [0.0, 0.8, -0.3])
+def test_a_queue_on_the_way_from_a_host_whose_clock_is_off_is_seen(
+    sink: RobotJsonSink, ahead_s: float
+) -> None:
+    clock = live_clock(sink)
+    clock.now += 10
+    waits = [0.0] * 20 + [0.15 * k for k in range(12)]
+    found = []
+    for waited in waits:
+        clock.now += 0.2
+        stamp = clock.wall_ns() + round((ahead_s - waited) * 1e9)
+        found.append(ages(sink, stamp, stamp))
+    told = list(zip(found, waits, strict=True))[20:]
+    assert all(age is None or age >= 1000 * waited - 25 for age, waited in told)
+
+
 @pytest.mark.parametrize("data", [b"{", b"{}", b'{"number":[],"time_ms":[],"domain":[]}',
                                   b'{"number":[1],"time_ms":[null],"domain":[0]}'])  # fmt: skip
 def test_a_clock_that_cannot_be_read_is_none(data: bytes) -> None:

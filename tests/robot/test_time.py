@@ -35,7 +35,7 @@ def test_a_jump_of_the_wall_clock_changes_no_age(jump: float) -> None:
     clock = FakeClock()
     placer = Placer(clock)
     clock.now += 60
-    placer.sample()
+    placer.place(0)
     before = clock.wall_ns()
     clock.now += 0.1
     clock.offset_s += jump
@@ -50,7 +50,7 @@ def test_an_hour_that_the_clock_showed_twice_counts_as_the_first_one() -> None:
     clock = FakeClock()
     placer = Placer(clock)
     clock.now += 60
-    placer.sample()
+    placer.place(0)
     clock.offset_s -= 2
     stamp = clock.wall_ns()
     clock.now += 0.1
@@ -80,7 +80,7 @@ def test_no_stamp_is_ever_placed_later_than_it_was_taken(
         taken.append((clock.wall_ns(), clock.now))
         clock.now += pause
         clock.offset_s += jump
-        placer.sample()
+        placer.place(0)
     clock.now += delay
     for stamp, moment in taken:
         placed = placer.place(stamp)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from mushpipe import (
     quaternion_from_axis,
 )
 from mushpipe.core.errors import UsageError
+from mushpipe.stages.nearest_depth import NearestDepth
 from mushpipe.stages.picks import MakePicks
 from mushpipe.stages.surroundings import hidden_share
 from tests.stages.scenes import CAMERA, frame_of
@@ -113,6 +115,16 @@ def test_locations_of_other_circles_are_refused() -> None:
     found = locations(DepthSource.MEASURED, DepthSource.MISSING, at=(80, 50))
     with pytest.raises(ValueError, match=r"row 0: the circle is at \(50, 50\).* \(80, 50\)"):
         MakePicks().process(frame_of(np.zeros((120, 160))), circles_at((50, 50), (80, 50)), found)
+
+
+@pytest.mark.parametrize("side", [(1, 0), (-1, 0), (0, 1), (0, -1)])
+def test_depth_on_the_rim_itself_is_depth_of_the_circle(side: tuple[int, int]) -> None:
+    for column, row, radius in product(range(30, 120, 7), range(30, 90, 5), (5, 10, 17)):
+        depth = np.full((120, 160), NAN)
+        depth[row + radius * side[1], column + radius * side[0]] = 0.4
+        frame = frame_of(np.zeros((120, 160)), depth)
+        circles = circles_at((column, row), radius=radius)
+        assert len(MakePicks().process(frame, circles, NearestDepth().process(frame, circles))) == 1
 
 
 def test_locations_of_two_neighbours_that_changed_places_are_refused() -> None:
