@@ -20,8 +20,8 @@ SUNKEN_M = 0.003  # a bright side that lies this much lower is the bed
 class ChanVese(Stage):
     """Segments by the Chan-Vese active contour (Chan & Vese 2001) with Otsu's start.
 
-    `fast` minimises the discrete energy to within a few thousandths of its exact minimum. `pde` is
-    the paper's level set (lambda1 = lambda2 = 1, nu = 0, p = 1) by scikit-image.
+    `fast` minimises the discrete energy, on beds to within a few thousandths of its exact minimum.
+    `pde` is the paper's level set (lambda1 = lambda2 = 1, nu = 0, p = 1) by scikit-image.
     `morphological` replaces the length by curvature steps (Marquez-Neila et al. 2014).
     """
 

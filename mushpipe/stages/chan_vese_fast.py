@@ -233,7 +233,11 @@ def _pyramid(
     iterations: int,
     sweeps: int,
 ) -> Bytes:
-    """Solve at half resolution first, with mu / 2: the length halves while the area quarters."""
+    """Solve at half resolution first, with mu / 2: the length halves while the area quarters.
+
+    What is small is nothing at a coarse level. Where no contour is left there this level begins
+    with its own; where none is left here the descent alone decides, which never goes up.
+    """
     height, width = initial.shape
     if depth > 1 and min(height, width) >= 32:
         half = (width // 2, height // 2)
@@ -241,10 +245,17 @@ def _pyramid(
         share = cv2.resize(2 * initial, half, interpolation=cv2.INTER_AREA)
         start = np.asarray(share > 1).view(np.uint8)
         solved = _pyramid(small, start, mu / 2, levels, depth - 1, 2 * iterations, 4 * sweeps)
-        u = doubled(solved, height, width)
+        u = doubled(solved, height, width) if _divides(solved) else initial.copy()
     else:
         u = initial.copy()
     c1, c2 = (np.full(len(planes), level) for level in levels or (0.0, 0.0))
-    return np.asarray(
-        _solve_level(planes, u, mu, c1, c2, levels is not None, (iterations, sweeps)), np.uint8
-    )
+    known = levels is not None
+    u = _solve_level(planes, u, mu, c1, c2, known, (iterations, sweeps))
+    if not _divides(u):
+        u = _solve_level(planes, initial.copy(), mu, c1, c2, known, (0, sweeps))
+    return np.asarray(u, np.uint8)
+
+
+def _divides(u: Bytes) -> bool:
+    """Return whether a region has an inside and an outside."""
+    return bool(u.any() and not u.all())

@@ -3,6 +3,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from benchmarks.graph_cut import graph_cut
 from mushpipe.stages.chan_vese import ChanVese
@@ -129,6 +131,35 @@ def test_colour_separates_what_gray_cannot() -> None:
     color[~truth] = (110, 138, 180)
     found = solve_fast((color / 255).astype(np.float32), truth[::-1, ::-1].copy(), MU)
     assert np.count_nonzero(found != truth) <= 4
+
+
+@pytest.mark.parametrize("radius", [4, 6, 8, 9, 10, 12, 14])
+def test_a_small_cap_alone_in_view_is_not_lost(radius: int) -> None:
+    """At the coarsest levels of the pyramid it is no pixel any more."""
+    rng = np.random.default_rng(radius)
+    v, u = np.mgrid[:480, :640]
+    for x, y in rng.uniform([40, 40], [600, 440], (10, 2)):
+        cap = np.hypot(u - x, v - y) <= radius
+        gray = np.clip(0.2 + 0.6 * cap + rng.normal(0, 0.016, cap.shape), 0, 1)
+        mask = ChanVese(check=False).process(frame_of(gray, camera=None)).foreground
+        assert np.count_nonzero(mask ^ cap) <= 0.1 * np.count_nonzero(cap)
+
+
+@given(
+    caps=st.lists(
+        st.tuples(st.floats(0, 160), st.floats(0, 120), st.floats(3, 15)), min_size=1, max_size=12
+    ),
+    contrast=st.floats(0.2, 0.8),
+    mu=st.sampled_from([0.005, 0.02, 0.1]),
+)
+@settings(max_examples=60, deadline=None)
+def test_no_mask_of_discs_costs_more_than_the_start_but_for_hundredths(
+    caps: list[tuple[float, float, float]], contrast: float, mu: float
+) -> None:
+    image = discs(caps, 0.1 + contrast, 0.1).astype(np.float32)
+    start = otsu_foreground(image)
+    limit = chan_vese_energy(image, start, mu)
+    assert chan_vese_energy(image, solve_fast(image, start, mu), mu) <= 1.02 * limit
 
 
 def test_known_levels_are_kept() -> None:
