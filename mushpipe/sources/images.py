@@ -167,8 +167,8 @@ def decode_camera(message: Any, rectified: bool) -> Camera | None:
 
     Raises:
         ValueError: The distortion model is one that is not implemented, a number is not finite, a
-            focal length not above 0, the matrix has more in it than a pinhole camera, or the
-            calibration says not for which size of image it is.
+            focal length not above 0, the matrix has more in it than a pinhole camera, the
+            calibration says not for which size of image it is, or its part lies beyond that.
     """
     k = list(message.k if hasattr(message, "k") else message.K)
     d = distortion(message)
@@ -200,7 +200,35 @@ def decode_camera(message: Any, rectified: bool) -> Camera | None:
                 "zeros behind); rectify the images"
             )
         coefficients = (*d[:count], *[0.0] * (count - len(d)))
-    return Camera(message.width, message.height, k[0], k[4], k[2], k[5], model, coefficients)
+    camera = Camera(message.width, message.height, k[0], k[4], k[2], k[5], model, coefficients)
+    return _of_part(camera, message)
+
+
+def _of_part(camera: Camera, message: Any) -> Camera:
+    """Return the calibration of images that are a part of the sensor's, or were made smaller.
+
+    A CameraInfo is of the whole image; the part (`roi`) is cut out first, then so many pixels a
+    side (`binning`) become one. As by image_geometry.PinholeCameraModel of ROS.
+    """
+    if not hasattr(message, "roi"):  # Foxglove's has none
+        return camera
+    across, down = max(1, message.binning_x), max(1, message.binning_y)
+    left, top = message.roi.x_offset, message.roi.y_offset
+    width, height = message.roi.width, message.roi.height
+    if left + width > camera.width or top + height > camera.height:
+        raise ValueError(
+            f"its roi, {width}x{height} from ({left}, {top}) on, lies beyond its image of "
+            f"{camera.width}x{camera.height}: set source.camera: {{fx: , fy: , cx: , cy: }}"
+        )
+    return replace(
+        camera,
+        width=(width or camera.width) // across,
+        height=(height or camera.height) // down,
+        fx=camera.fx / across,
+        fy=camera.fy / down,
+        cx=(camera.cx - left) / across,
+        cy=(camera.cy - top) / down,
+    )
 
 
 def with_ros2_names(schema: Schema | None) -> Schema | None:

@@ -100,8 +100,10 @@ def camera_info(
     model: str = "plumb_bob",
     p: tuple[float, ...] = (0,) * 12,
     frame_id: str = OPTICAL,
+    binning: tuple[int, int] = (0, 0),
+    roi: tuple[int, int, int, int] = (0, 0, 0, 0),
 ) -> Any:
-    region = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0)
+    region = dict(zip(("x_offset", "y_offset", "width", "height"), roi, strict=True))
     return ros(
         "sensor_msgs/msg/CameraInfo",
         header=header(stamp_ns, frame_id),
@@ -112,8 +114,8 @@ def camera_info(
         k=np.array(k, float),
         r=np.eye(3).ravel(),
         p=np.array(p, float),
-        binning_x=0,
-        binning_y=0,
+        binning_x=binning[0],
+        binning_y=binning[1],
         roi=ros("sensor_msgs/msg/RegionOfInterest", **region, do_rectify=False),
     )
 

@@ -221,6 +221,37 @@ def test_calibration_of_another_size_is_refused(tmp_path: Path) -> None:
     assert error.value.exit_code == 4
 
 
+@pytest.mark.parametrize("binning", [(0, 0), (1, 1), (2, 2), (3, 1)])
+@pytest.mark.parametrize("part", [(0, 0, 0, 0), (0, 0, 24, 18), (5, 2, 16, 12)])
+def test_a_part_of_the_sensor_and_binning_are_as_image_geometry_has_them(
+    binning: tuple[int, int], part: tuple[int, int, int, int], tmp_path: Path
+) -> None:
+    """A point of space is seen where its pixel of the whole image went."""
+    k = (50.0, 0, 11.0, 0, 55.0, 8.0, 0, 0, 1)
+    left, top, wide, high = part
+    across, down = max(1, binning[0]), max(1, binning[1])
+    size = ((wide or 24) // across, (high or 18) // down)
+    info = camera_info(size=(24, 18), k=k, binning=binning, roi=part)
+    image = raw_image(np.zeros((size[1], size[0], 3), np.uint8), "rgb8")
+    frame = play(write_bag(tmp_path, [(COLOR_INFO, T0, info), (COLOR, T0, image)]))[0]
+    assert frame.camera is not None
+    u, v = 50 * 0.03 / 0.4 + 11, 55 * 0.02 / 0.4 + 8
+    seen = frame.camera.project(np.array([[0.03, 0.02, 0.4]]))[0]
+    np.testing.assert_allclose(seen, [(u - left) / across, (v - top) / down])
+
+
+def test_a_part_beyond_its_image_is_refused(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A driver that gives the size of the part, and perhaps its matrix: nobody can tell."""
+    source = McapSource(
+        path=write_bag(tmp_path, [(COLOR_INFO, T0, camera_info(roi=(3, 2, 8, 6))), *COLORS])
+    )
+    with pytest.raises(InputError, match=r"roi, 8x6 from \(3, 2\) on, lies beyond"):
+        list(source.frames())
+    assert "has no calibration" in caplog.text
+
+
 def shrinking() -> list[Entry]:
     small = raw_image(color_pixels(1, SMALL), "rgb8", T0 + PERIOD)
     return [color_at(0), (COLOR, T0 + PERIOD, small)]
