@@ -16,16 +16,43 @@ logger = logging.getLogger("mushpipe")
 NEAREST_M, FARTHEST_M = 0.02, 30.0
 COARSE_M = 0.003  # a cap of 30 mm rises by 9
 WIDEST_DEG = 160.0
+STILL = 30  # frames
+_APART = 16  # px between those that are compared first
 _FEWEST_LEVELS = 6
 _FEWEST_EACH = 8  # depths a level: unlike steps, chance seldom meets a level twice
 
 
 def judged(frames: Iterator[RgbdFrame], name: str) -> Iterator[RgbdFrame]:
-    """Pass frames on, and warn of the first that has depth where that is odd."""
-    done = False
+    """Pass frames on, and warn of the first that has depth where that is odd.
+
+    And, once, where depth stands still: noise lets no sensor give the same image twice.
+    """
+    done, last, same = False, None, 0
     for frame in frames:
         done = done or _warned(name, frame)
+        same = same + 1 if last is not None and _stands_still(frame, last) else 0
+        if same == STILL:
+            logger.warning(
+                "%s, frame %d: depth has been the same, to the last digit, for %d frames in which "
+                "colour changed: its sensor or driver may have stopped, and positions are of then",
+                *(name, frame.header.sequence, same),
+            )
+        last = frame
         yield frame
+
+
+def _stands_still(frame: RgbdFrame, last: RgbdFrame) -> bool:
+    """Return whether depth, of which some is known, is the same as before, and colour is not."""
+    depth, before = frame.depth, last.depth
+    if depth is None or before is None or depth.shape != before.shape:
+        return False
+    few = depth[::_APART, ::_APART]
+    return bool(
+        np.array_equal(few, before[::_APART, ::_APART])
+        and np.array_equal(depth, before)
+        and depth.any()
+        and not np.array_equal(frame.color, last.color)
+    )
 
 
 def _warned(name: str, frame: RgbdFrame) -> bool:

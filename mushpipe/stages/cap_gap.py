@@ -24,6 +24,9 @@ ENOUGH, AMISS, SHIFTED = 100, 1.5, 2.0
 # may lie UNSURE further off. It is looked again each time so many frames have come.
 PATIENCE, FEW, UNSURE = 60, 12, 1.5
 LATEST = 1000  # edges, and circles, that are kept
+# Of so many places where a cap ends in colour, and depth is known all around, this share at least
+# is an edge in depth as well: on beds 0.3 or more, with depth 12 px beside colour 0.16.
+PLACES, CONFIRMED = 200, 0.2
 _OUTLIER = 2.0  # px from what is usual
 # Least eigenvalue of the normal matrix; 0.5 where all sides are alike. A projector's shadow hides
 # depth beside each cap on one side: beds have 0.05 to 0.3, and tell shifts of 5 px to about 1 px.
@@ -42,6 +45,7 @@ class EdgeWatch:
     def __init__(self) -> None:
         self._gaps: Floats | None = np.zeros((0, 3))  # None once they were judged
         self._seen = np.zeros((0, 2))  # centres of the circles that were looked at, px
+        self._places = self._confirmed = 0
         self._frames = 0
 
     def look(self, frame: RgbdFrame, circles: Circles, edge_offset_px: float) -> None:
@@ -60,7 +64,13 @@ class EdgeWatch:
         away = np.linalg.norm(circles.center[:, None] - self._seen, axis=2)
         new = circles.take((away > circles.radius[:, None]).all(axis=1))
         self._seen = np.concatenate([self._seen, new.center])[-LATEST:]
-        self._gaps = gaps = np.concatenate([self._gaps, edge_gaps(frame, new)])[-LATEST:]
+        found_now, places = edge_gaps(frame, new)
+        self._gaps = gaps = np.concatenate([self._gaps, found_now])[-LATEST:]
+        self._places, self._confirmed = self._places + places, self._confirmed + len(found_now)
+        if self._places >= PLACES and self._confirmed < CONFIRMED * self._places:
+            _tell_strange(self._places, self._confirmed)
+            self._gaps = None
+            return
         enough = len(gaps) >= ENOUGH
         found = usual(gaps) if enough or (patient and len(gaps) >= FEW) else None
         if found is None:
@@ -68,6 +78,15 @@ class EdgeWatch:
         amiss = _tell(-found[0], edge_offset_px, (found[1], found[2]), 0 if enough else UNSURE)
         if enough or amiss:
             self._gaps = None
+
+
+def _tell_strange(places: int, confirmed: int) -> None:
+    """Warn that depth shows hardly any of the edges that colour shows."""
+    logger.warning(
+        "cap-fit: of %d places where colour shows the edge of a cap, depth has one at %d only: it "
+        "is not aligned to colour, or of another moment or scene; positions are not to be trusted",
+        *(places, confirmed),
+    )
 
 
 def _tell(lost: float, stated: float, shift: tuple[float, float], unsure: float) -> bool:
@@ -114,7 +133,7 @@ def usual(gaps: Floats) -> Floats | None:
     return found
 
 
-def edge_gaps(frame: RgbdFrame, circles: Circles) -> Floats:
+def edge_gaps(frame: RgbdFrame, circles: Circles) -> tuple[Floats, int]:
     """Return by how much edges in depth lie outside of those in colour, and where (K, 3).
 
     Distance, px, and direction from the centre, x and y of a unit vector. Looked for along 32
@@ -123,22 +142,28 @@ def edge_gaps(frame: RgbdFrame, circles: Circles) -> Floats:
     Args:
         frame: With depth and calibration.
         circles: Outlines of caps.
+
+    Returns:
+        These, and at how many places colour shows an edge, whether or not depth does.
     """
     if frame.camera is None:
         raise ValueError("a frame without calibration")
     large = np.argsort(-circles.radius, kind="stable")[:MOST]
     large = large[circles.radius[large] >= LEAST_RADIUS]
     if not len(large):
-        return np.zeros((0, 3))
+        return np.zeros((0, 3)), 0
     depth = np.nan_to_num(frame.depth_m)
     found = [
         _gaps(frame.gray, depth, frame.camera.fx, circles.center[k], float(circles.radius[k]))
         for k in large
     ]
-    return np.concatenate(found)
+    gaps, places = zip(*found, strict=True)
+    return np.concatenate(gaps), sum(places)
 
 
-def _gaps(gray: Singles, depth: Singles, fx: float, center: Floats, radius: float) -> Floats:
+def _gaps(
+    gray: Singles, depth: Singles, fx: float, center: Floats, radius: float
+) -> tuple[Floats, int]:
     reach = min(_REACH, _SHARE * radius)
     away = np.arange(-reach, reach + 1e-6, _STEP)
     angle = np.arange(_DIRECTIONS)[:, None] * (2 * np.pi / _DIRECTIONS)
@@ -148,13 +173,13 @@ def _gaps(gray: Singles, depth: Singles, fx: float, center: Floats, radius: floa
     height, width = gray.shape
     inside = ((x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)).all(axis=1)
     if not inside.any():
-        return np.zeros((0, 3))
+        return np.zeros((0, 3)), 0
     luma = cv2.remap(gray, x[inside], y[inside], cv2.INTER_LINEAR)
     z = cv2.remap(depth, x[inside], y[inside], cv2.INTER_NEAREST)
     known = (z > 0).all(axis=1)
     luma, z, direction = luma[known], z[known], direction[inside][known]
     if not len(z):
-        return np.zeros((0, 3))
+        return np.zeros((0, 3)), 0
     rows = np.arange(len(z))
     drop = z[:, 2:] - z[:, :-2]
     edge = drop.argmax(axis=1)
@@ -162,8 +187,9 @@ def _gaps(gray: Singles, depth: Singles, fx: float, center: Floats, radius: floa
     least = np.maximum(_DROP_M, _DROP_SHARE * radius * z[:, 0] / fx)
     fall = np.abs(luma[:, 2 * _WIDE :] - luma[:, : -2 * _WIDE])
     steepest = fall.argmax(axis=1)
-    good = (drop[rows, edge] >= least) & (fall[rows, steepest] >= _LEAST_FALL)
-    good &= (steepest > 0) & (steepest < fall.shape[1] - 1)  # at an end it may lie beyond
+    seen = fall[rows, steepest] >= _LEAST_FALL
+    seen &= (steepest > 0) & (steepest < fall.shape[1] - 1)  # at an end it may lie beyond
+    good = seen & (drop[rows, edge] >= least)
     middle = (away[edge + 1] + away[last + 1]) / 2
     gap = middle[good] - away[steepest[good] + _WIDE]
-    return np.column_stack([gap, direction[good]])
+    return np.column_stack([gap, direction[good]]), int(seen.sum())

@@ -17,6 +17,7 @@ from mushpipe.stages.doubling import doubled
 from mushpipe.stages.phase_blobs import blobs_of
 from mushpipe.stages.phase_decide import decide
 from mushpipe.stages.phase_depth import NO_RELIEF, Relief, relief_of
+from mushpipe.stages.phase_doubt import Contradiction
 from mushpipe.stages.phase_edges import Gradient, edges_of, gradient_of, otsu_of
 from mushpipe.stages.phase_features import AT_LEARNED, static_features
 from mushpipe.stages.phase_fuse import fused
@@ -120,6 +121,7 @@ class PhaseHough(Stage):
     verifier: GraphPath | None = Field(None, description="another verifier than the package's")
 
     _models: Models | None = PrivateAttr(None)
+    _contradiction: Contradiction = PrivateAttr(default_factory=Contradiction)
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -139,6 +141,7 @@ class PhaseHough(Stage):
         """Read the verifier and compile the kernels."""
         self._load()
         self._warm_up()
+        self._contradiction = Contradiction()
 
     def process(self, frame: RgbdFrame, mask: Mask, learned: Circles | None = None) -> Circles:
         """Return the circles in the order they were accepted in; by score beside `learned`.
@@ -170,6 +173,9 @@ class PhaseHough(Stage):
             return circles
         if found.relief.known:
             unseen = found.table[order, AT_LEARNED] == 0
+            likely = score >= LIKELY
+            parts = circles.take(likely), unseen[likely], found.learned
+            self._contradiction.look(frame.header.sequence, *parts)
             return certain_first(without_clods(frame.color, circles, unseen))
         sure = found.learned.take(found.learned.score >= max(_SURE, self.min_score))
         radius = equal_area_radius(found.shapes)

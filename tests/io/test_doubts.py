@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mushpipe import Camera, Header, RgbdFrame
-from mushpipe.core.doubts import doubts
+from mushpipe.core.doubts import STILL, doubts, judged
 from tests.core.lab import Frames, Lab
 from tests.stages.frames import recorded
 
@@ -96,3 +96,26 @@ def test_any_source_is_told_once_of_units_that_cannot_be(
         assert lab.run(lab.chain("threshold", source="own")).error is None
     assert caplog.text.count("frame 0: ") == len(caplog.messages) == (1 if message else 0)
     assert message in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("still", "color_moves", "said"),
+    [(True, True, True), (True, False, False), (False, True, False)],
+)
+def test_depth_that_stands_still_while_colour_goes_on_is_told_of_once(
+    still: bool, color_moves: bool, said: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    rng = np.random.default_rng(0)
+    first = rng.integers(3000, 3200, (48, 64), np.uint16)
+
+    def frames() -> Iterator[RgbdFrame]:
+        for number in range(100):
+            color = np.full_like(COLOR, number if color_moves else 0)
+            depth = first.copy()
+            if not still:
+                depth[7, 9] += number % 2
+            yield RgbdFrame(Header(number, number, "camera"), color, depth, 0.000125)
+
+    assert len(list(judged(frames(), "bed.mcap"))) == 100
+    told = [text for text in caplog.messages if "depth has been the same" in text]
+    assert [text.split(":")[0] for text in told] == [f"bed.mcap, frame {STILL}"] * said

@@ -37,8 +37,8 @@ def test_gaps_tell_what_depth_is_wider_by_and_where_it_lies(
     depth = np.where(near, 0.47, 0.5).astype(np.float32)
     camera = Camera(320, 240, 617, 617, 160, 120)
     frame = RgbdFrame(Header(0, 0, "camera"), color, depth, 1.0, camera)
-    gaps = edge_gaps(frame, Circles(np.array([[x, y]]), np.array([40.4]), np.ones(1)))
-    assert len(gaps) == 32
+    gaps, places = edge_gaps(frame, Circles(np.array([[x, y]]), np.array([40.4]), np.ones(1)))
+    assert len(gaps) == places == 32
     found = usual(gaps)
     assert found == pytest.approx([wider, *shift], abs=0.35)  # pixels of depth are in or out
 
@@ -130,6 +130,22 @@ def test_shadows_beside_all_caps_keep_nobody_from_telling(
     told = [float(f[1]) * (1 if f[2] == "right" else -1) for f in found if f]
     assert len(told) == len(found) == (right != 0)
     assert told == pytest.approx([right] * len(told), abs=1.3)
+
+
+@pytest.mark.parametrize("right", [-25, -14, 14, 25])
+def test_depth_far_beside_colour_is_told_of_as_well(
+    right: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Farther than edges are looked for."""
+    watch = EdgeWatch()
+    for seed in range(9000, 9010):
+        frame = simulated(seed, width=640, height=480, count=80)
+        truth = frame.attached[TRUTH_TOPIC].take(frame.attached[TRUTH_TOPIC].ignore == 0)
+        assert frame.depth is not None
+        seen = replace(frame, depth=np.roll(frame.depth, right, axis=1))
+        watch.look(seen, Circles(truth.center, truth.radius, np.ones(len(truth))), 0.7)
+    (message,) = caplog.messages
+    assert "not aligned to colour" in message
 
 
 @pytest.mark.parametrize("shift", [(0, 0), (5, 0), (0, 5), (0, -5)])
