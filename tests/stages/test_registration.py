@@ -1,15 +1,19 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from mushpipe import Circles, DepthSource, InputError, Locations
 from mushpipe.core.errors import DependencyError
+from mushpipe.core.truth import TRUTH_TOPIC
 from mushpipe.stages.nearest_depth import NearestDepth
 from mushpipe.stages.registration import Registration
 from mushpipe.stages.upright_model import made, read
 from tests.stages.caps import angle, cap, circles_of, draw, frame_from
+from tests.stages.frames import simulated
 
 try:
     from mushpipe.core.libraries import import_open3d
@@ -69,12 +73,16 @@ def test_the_pieces_are_those_of_open3d_called_by_hand() -> None:
     target.orient_normals_towards_camera_location(-center / 0.02)
     r = o3d.pipelines.registration
     search = o3d.geometry.KDTreeSearchParamHybrid(0.6, 100)
-    features = [r.compute_fpfh_feature(c, search) for c in (source, target)]
+    of_source, of_target = (r.compute_fpfh_feature(c, search).data.T for c in (source, target))
+    apart = np.linalg.norm(of_target[:, None] - of_source, axis=2)
+    matches = np.column_stack([apart.argmin(axis=1), np.arange(len(of_target))]).astype(np.int32)
     o3d.utility.random.seed(5)
     option = r.FastGlobalRegistrationOption(
-        maximum_correspondence_distance=0.18, use_absolute_scale=True
+        maximum_correspondence_distance=0.18, use_absolute_scale=True, decrease_mu=True
     )
-    coarse = r.registration_fgr_based_on_feature_matching(source, target, *features, option)
+    coarse = r.registration_fgr_based_on_correspondence(
+        source, target, o3d.utility.Vector2iVector(matches), option
+    )
     start = coarse.transformation
     if start[2, 2] < 0.5:
         start = np.eye(4)
@@ -88,6 +96,50 @@ def test_the_pieces_are_those_of_open3d_called_by_hand() -> None:
     ).transformation
     assert found.axis == pytest.approx(fine[:3, :3] @ [0, 0, -1], abs=1e-4)
     assert found.apex == pytest.approx((fine @ [0, 0, -0.62, 1])[:3] * 0.02 + center, abs=1e-5)
+
+
+@pytest.mark.parametrize("angle_deg", [20.0, 45.0, 90.0])
+def test_global_registration_finds_a_turn_far_from_upright(angle_deg: float) -> None:
+    """Of a body that is no surface of revolution: three arms of different lengths."""
+    rng, arms = np.random.default_rng(0), []
+    for k, length in enumerate((0.5, 0.9, 1.4)):
+        arm = rng.uniform(-0.15, 0.15, (700, 3))
+        side = (k + 1) % 3
+        arm[:, side] = np.sign(arm[:, side]) * 0.15
+        arm[:, k] = rng.uniform(0, length, 700)
+        arms.append(arm)
+    turn = Rotation.from_rotvec(np.radians(angle_deg) * np.array([0.6, 0.48, 0.64]))
+    clouds, body = [], np.concatenate(arms)
+    for points in (body, turn.apply(body) + np.array([0.2, -0.1, 0.1])):
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+        cloud = cloud.voxel_down_sample(0.06)
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(0.18, 30))
+        cloud.orient_normals_towards_camera_location(points.mean(axis=0) * 2)
+        clouds.append(cloud)
+    o3d.utility.random.seed(1)
+    found = stage(voxel=0.06, **{"global": "fgr"})._start(o3d, *clouds)
+    assert (Rotation.from_matrix(found[:3, :3]) * turn.inv()).magnitude() < np.radians(8)
+
+
+def test_global_registration_turns_the_model_of_most_mushrooms() -> None:
+    found = stage(**{"global": "fgr"})
+    turned = []
+    begin = Registration._start
+
+    def noted(self: Registration, library: Any, source: Any, target: Any) -> np.ndarray:
+        start = begin(self, library, source, target)
+        turned.append(not np.array_equal(start, np.eye(4)))
+        return start
+
+    frame = simulated(9000, width=640, height=480, tilt_deg=(5, 30))
+    truth = frame.attached[TRUTH_TOPIC].take(frame.attached[TRUTH_TOPIC].ignore == 0)
+    circles = Circles(truth.center, truth.radius, np.ones(len(truth)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Registration, "_start", noted)
+        found.process(
+            frame, circles, NearestDepth().process(frame, circles), np.random.default_rng(0)
+        )
+    assert np.mean(turned) > 0.6
 
 
 def test_the_clouds_before_and_after_show_the_model_move_onto_the_sample() -> None:
