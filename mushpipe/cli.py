@@ -79,7 +79,7 @@ def _compile(
     from mushpipe.core.graph import compile_document
     from mushpipe.core.plugins import load_registry
 
-    document = capsule_document(graph) if graph.suffix == ".mcap" else read_document(graph)
+    document = capsule_document(graph) if graph.suffix.lower() == ".mcap" else read_document(graph)
     for name in more_sinks:
         sinks = document.data.get("sinks") or {}
         if isinstance(sinks, dict):
@@ -211,13 +211,20 @@ def schema(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="file to write")] = None,
 ) -> None:
     """Print the JSON Schema of graph files, for completion in an editor."""
+    from mushpipe.core.errors import MushpipeError
     from mushpipe.core.overwriting import require_writable
     from mushpipe.core.plugins import load_registry
     from mushpipe.core.schema import graph_schema
 
     require_writable(out)
     text = json.dumps(graph_schema(load_registry()), indent=2)
-    _out(text) if out is None else out.write_text(text + "\n")
+    if out is None:
+        _out(text)
+        return
+    try:
+        out.write_text(text + "\n")
+    except OSError as error:
+        raise MushpipeError(f"{out}: cannot be written: {error.strerror}") from error
 
 
 @plugins_app.command("list")

@@ -39,7 +39,7 @@ def figure(
 ) -> None:
     """Draw a figure of the paper from a frame of a result recording."""
     from mushpipe.console import set_up_logging
-    from mushpipe.core.errors import UsageError
+    from mushpipe.core.errors import MushpipeError, UsageError
     from mushpipe.core.overwriting import require_writable, spare
     from mushpipe.figure import KINDS, draw_pose
     from mushpipe.traces import read_manifest, read_trace
@@ -60,8 +60,10 @@ def figure(
         drawn = KINDS[kind](trace)
     try:
         drawn.savefig(out)
-    except (OSError, ValueError) as error:  # no such folder; a suffix matplotlib does not know
+    except ValueError as error:  # a suffix that matplotlib does not know
         raise UsageError(f"{out}: {error}") from error
+    except OSError as error:
+        raise MushpipeError(f"{out}: cannot be written: {error.strerror}") from error
 
 
 def view(

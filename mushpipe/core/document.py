@@ -94,7 +94,9 @@ def parse_document(text: str, file: str, base: Path) -> Document:
         mark = error.problem_mark or error.context_mark
         line, column = (mark.line + 1, mark.column + 1) if mark else (0, 0)
         excerpt = document._excerpt(line) if line else ""
-        message = f"not valid YAML: {error.problem or error.context}"
+        problem = error.problem or error.context or ""
+        whole = f"{error.context}, {problem}" if problem.startswith("but ") else problem
+        message = f"not valid YAML: {whole}"
         raise GraphError([Problem(file, line, column, message, "", excerpt)]) from error
     except _UNREADABLE as error:
         reason = "it is nested too deeply" if isinstance(error, RecursionError) else error

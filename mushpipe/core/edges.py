@@ -28,11 +28,17 @@ SINK_QUEUE = 4
 LEAP_NS = 60 * 10**9
 
 
+# as numpy says it: to what is written into an array, and to what changes one in place
+_READ_ONLY = ("assignment destination is read-only", "output array is read-only")
+
+
 def failure(node: Node, sequence: int | None, error: BaseException) -> StageError:
     """Say which plugin failed on which frame, keeping the exit code of a known error."""
     at = "" if sequence is None else f" on frame {sequence}"
     known = isinstance(error, MushpipeError)
     text = str(error) if known else f"{type(error).__name__}: {error}"
+    if isinstance(error, ValueError) and str(error) in _READ_ONLY:
+        text += "; frames and tables belong to all stages: copy an array before changing it"
     code = error.exit_code if isinstance(error, MushpipeError) else 1
     if not known:
         logger.debug("where %s '%s' failed:", node.kind, node.name, exc_info=error)

@@ -37,6 +37,8 @@ def faults_of(
             what = place + of if place else f"'{use}'"
             given = f", got {json.dumps(item['input'], default=str)}" if place else ""
             message = item["msg"].removeprefix("Value error, ")
+            if item["type"] == "dict_type" and not use:
+                message = _expected(path)
             if item["type"] == "json_invalid":  # half a character: "\ud800", or of a name
                 what = what if use else "the graph"
                 message = "a text in it is not UTF-8: give the file another name"
@@ -46,6 +48,13 @@ def faults_of(
                 given = f" (with {labels})" if labels else ""
             problems.append(document.problem(path, f"{what}: {message}{given}"))
     return problems
+
+
+def _expected(path: Location) -> str:
+    """Return what a graph has at a place where it has no mapping."""
+    if len(path) == 1 and path[0] in ("stages", "sinks"):
+        return "expected names with their settings, such as 'segment: {use: otsu}', and no list"
+    return "expected settings in braces, such as {use: otsu}"
 
 
 def _known(model: type[BaseModel], place: Location) -> list[str]:

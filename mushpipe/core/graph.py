@@ -92,7 +92,7 @@ def compile_document(
         for kind, group in entries.items()
     }
     complete = [node for group in nodes.values() for node in group if node is not None]
-    if nodes["source"] and len(complete) == sum(map(len, nodes.values())):
+    if nodes["source"] and len(complete) == sum(map(len, nodes.values())) and _shaped(document):
         problems += wire(document, registry, complete)
     if not problems:
         problems += _check_files(document, complete)
@@ -133,6 +133,12 @@ def _entries(document: Document) -> dict[Kind, list[tuple[Location, dict[str, An
         "stage": named("stages"),
         "sink": named("sinks"),
     }
+
+
+def _shaped(document: Document) -> bool:
+    """Return whether every stage can be checked: those below may need what it makes."""
+    stages = document.data.get("stages", {})
+    return isinstance(stages, dict) and all(isinstance(each, dict) for each in stages.values())
 
 
 def _replace_source(document: Document, source: str, registry: Registry) -> None:
@@ -196,21 +202,24 @@ class _Named(RunInfo):
 
 
 def _check_files(document: Document, nodes: list[Node]) -> list[Problem]:
-    """Return which sinks would write the same file; other ways to one are found by a run."""
+    """Return which sinks would write over what is read, or over one another's file.
+
+    Other ways to one file are found by a run.
+    """
     problems: list[Problem] = []
     taken: list[tuple[Path, str]] = []
     for node in nodes:
         files: tuple[Path, ...] = ()
         with suppress(Exception):  # of a plugin, whose fault a run tells of
+            if isinstance(node.plugin, Source):
+                taken = [(Path(path), "what is read") for path in node.plugin.files()]
             if isinstance(node.plugin, Sink):
                 files = tuple(map(Path, node.plugin.files(_Named("", {}))))
         for path in files:
             if others := [name for other, name in taken if same_file(path, other)]:
-                message = (
-                    f"sink '{node.name}' would write over the file of sink '{others[0]}', {path}"
-                )
+                message = f"sink '{node.name}' would write over {others[0]}, {path}"
                 problems.append(document.problem(("sinks", node.name), message, key=True))
-        taken += [(path, node.name) for path in files]
+        taken += [(path, f"the file of sink '{node.name}'") for path in files]
     return problems
 
 

@@ -44,6 +44,7 @@ ZSTD = b"\x28\xb5\x2f\xfd"  # what Zstandard's frames begin with
 CONVERT = "'rosbags-convert --src {} --dst NEW_FOLDER --dst-storage mcap'"
 # What other recordings begin with: what they are, and what makes them readable.
 _OTHERS = {
+    b"rosbag2_": "what describes a bag: the file beside it that it names is the recording",
     b"SQLite f": f"a ROS 2 bag in SQLite: {CONVERT.format('ITS_FOLDER')} makes MCAP of it",
     b"#ROSBAG ": f"a bag of ROS 1: {CONVERT.format('FILE')} makes MCAP of it; one of Intel's "
     "viewer is played where its name ends with .bag",
@@ -52,6 +53,12 @@ _OTHERS = {
         (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"), "an image: give its folder to play all of them"
     ),
 }
+
+
+def _recordings_in(folder: Path) -> str:
+    """Return what to give in place of a folder."""
+    found = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".mcap")
+    return f"; a recording is a file: {found[0]}" if found else ", in which no recording is"
 
 
 class Raw(NamedTuple):
@@ -118,6 +125,8 @@ class RecordingReader:
                     f"{path}: it is a pipe, and recordings are read more than once: save it as a "
                     "file; a graph plays what is piped into 'mushpipe run GRAPH --source -'"
                 )
+            if path.is_dir():
+                raise UsageError(f"{path}: it is a folder{_recordings_in(path)}")
             with path.open("rb") as file:
                 magic = file.read(8)
         except FileNotFoundError:

@@ -139,7 +139,12 @@ def bench(
     _show(result, ratios)
     if out is not None:
         out.write_text(json.dumps(result, indent=2) + "\n")
-    raise typer.Exit(EXIT_DIFFERS if max(ratios.values(), default=0.0) > allow else 0)
+    too_slow = {name: ratio for name, ratio in ratios.items() if ratio > allow}
+    for name, ratio in too_slow.items():
+        logging.getLogger("mushpipe").error(
+            f"{name} takes {ratio:.2f} times as long as in {baseline}; --allow is {allow:g}"
+        )
+    raise typer.Exit(EXIT_DIFFERS if too_slow else 0)
 
 
 def _endless(plan: Plan, frames: int, speed: float) -> Plan:

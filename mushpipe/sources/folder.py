@@ -112,6 +112,7 @@ class ImagesSource(ReplaySource):
         if self.depth is None:
             return [(path, None) for path in colors.values()]
         depths = _required(self.path, "depth", self.depth)
+        colors = {key: path for key, path in colors.items() if path not in depths.values()}
         both = colors.keys() & depths.keys()
         if not both:
             raise InputError(
@@ -130,7 +131,13 @@ class ImagesSource(ReplaySource):
         how = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
         if depth is not None or self.camera is not None:  # these are of the image as it was taken
             how |= cv2.IMREAD_IGNORE_ORIENTATION
-        image = cv2.cvtColor(_read(color, how), _TO_RGB)
+        read = _read(color, how)
+        if read.dtype != np.uint8:
+            raise InputError(
+                f"{color}: {8 * read.itemsize} bits a channel, expected 8; where it is depth, name "
+                "it by source.depth, and what is colour by source.color"
+            )
+        image = cv2.cvtColor(read, _TO_RGB)
         values = None if depth is None else _read(depth, cv2.IMREAD_UNCHANGED)
         size = image.shape[:2]
         self._first = self._first or size
@@ -193,6 +200,8 @@ def _read(path: Path, how: int) -> NDArray[Any]:
         data = np.frombuffer(path.read_bytes(), np.uint8)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    if cv2.imcount(str(path)) > 1:
+        raise InputError(f"{path}: it holds several images: make a file of each")
     image = cv2.imdecode(data, how) if len(data) else None
     if image is None:
         raise InputError(f"{path}: it is no image, or damaged")

@@ -104,8 +104,10 @@ class Player:
         if min(pairing.color_alone, pairing.depth_alone) > self.frames / 2:
             self._warn(
                 f"most colour and depth images are without a partner: their stamps differ by more "
-                f"than source.pair_tolerance_ms, {self.settings.pair_tolerance_ms:g}; where one of "
-                "both is only later, set it higher"
+                f"than source.pair_tolerance_ms, {self.settings.pair_tolerance_ms:g}, or they lie "
+                f"more than {Pairing.PATIENCE} images apart in the file; where one of both is only "
+                "later, set it higher; where one topic was written behind the other, sort the file "
+                "by time ('mcap sort')"
             )
         self.counts["colour images without depth"] += pairing.color_alone
         self.counts["depth images without colour"] += pairing.depth_alone

@@ -72,7 +72,8 @@ class StreamSource(RecordedSource):
                 "nothing is piped into this program: 'mushpipe record -o - | mushpipe run GRAPH "
                 "--source -'"
             )
-        self._input = BufferedReader(_Input(self._number, self._interrupted), _BUFFER)
+        raw = _Input(self._number, self._interrupted)
+        self._input = BufferedReader(raw, _BUFFER)
         records = StreamReader(self._input, validate_crcs=True).records
         try:
             head = list(islice(records, 2))  # the header; the manifest, if mushpipe sends
@@ -81,7 +82,8 @@ class StreamSource(RecordedSource):
         except GARBAGE as error:
             if self._interrupted.is_set():
                 return
-            raise InputError("standard input is empty: see what its sender says") from error
+            what = f"ends after {raw.count} bytes" if raw.count else "is empty"
+            raise InputError(f"standard input {what}: see what its sender says") from error
         for record in head:
             if isinstance(record, Metadata) and record.name == MANIFEST:
                 self._manifest = record.metadata
@@ -217,6 +219,7 @@ class _Input(RawIOBase):
         self._number = number
         self._interrupted = interrupted
         self.patient = True  # else what does not come soon is taken for the end
+        self.count = 0  # bytes that came
 
     def readable(self) -> bool:
         return True
@@ -224,7 +227,9 @@ class _Input(RawIOBase):
     def readinto(self, buffer: Any) -> int:
         while not self._interrupted.is_set():
             if select.select([self._number], [], [], _POLL_S)[0]:
-                return os.readv(self._number, [buffer])
+                count = os.readv(self._number, [buffer])
+                self.count += count
+                return count
             if not self.patient:
                 break
         return 0

@@ -23,6 +23,7 @@ ALIGNED = "aligned_depth_to_color"
 _WORDS = {"depth": ("depth",), "infra": ("infra",), "color": ("color", "colour", "rgb")}
 # What else parts of a topic say of the images, and not of the camera.
 _OF_IMAGES = ("image", "rect", "registered", "stereo")
+_RAW = 1.1  # what a raw image is worth beside compressed ones
 _TRANSPORTS = ("/compressedDepth", "/compressed")
 
 
@@ -55,7 +56,7 @@ def choose_topics(
     for wanted, kinds in ((color, IMAGES), (depth, IMAGES), (camera, CALIBRATIONS)):
         if wanted is not None:
             _check_named(index, path, wanted, kinds)
-    images = _topics(index, IMAGES)
+    images = _images(index)
     color = color or _one(path, "color", _colors(images))
     if color is None:
         found = ", ".join(sorted(index.channels)) or "no topics at all"
@@ -115,24 +116,29 @@ def _says(part: str, words: Iterable[str]) -> bool:
 
 def _colors(images: list[str]) -> list[str]:
     named = [t for t in images if _kind(t) == "color"]
-    return _without_transports(named or [t for t in images if not _kind(t)])
+    return named or [t for t in images if not _kind(t)]
 
 
 def _depths(images: list[str]) -> list[str]:
     depths = [t for t in images if _kind(t) == "depth"]
     aligned = [t for t in depths if ALIGNED in t.lower()]
-    return _without_transports(aligned or depths)
+    return aligned or depths
 
 
 def untold_images(index: Index, color: str) -> list[str]:
     """Return the topics of other images whose names do not say of what: depth may be one."""
-    images = _topics(index, IMAGES)
-    return _without_transports([t for t in images if not _kind(t) and _base(t) != _base(color)])
+    return [t for t in _images(index) if not _kind(t) and _base(t) != _base(color)]
 
 
-def _without_transports(topics: list[str]) -> list[str]:
-    """Drop the compressed twin of a topic that is there raw."""
-    return [t for t in topics if _base(t) == t or _base(t) not in topics]
+def _images(index: Index) -> list[str]:
+    """Return the topics of images; of one that is there raw and compressed the fuller."""
+    best: dict[str, str] = {}
+    for topic in _topics(index, IMAGES):
+        twins = (best.get(_base(topic), topic), topic)
+        best[_base(topic)] = max(
+            twins, key=lambda t: index.counts[t] * (_RAW if t == _base(t) else 1)
+        )
+    return sorted(best.values())
 
 
 def _base(topic: str) -> str:
@@ -145,7 +151,8 @@ def _calibration(index: Index, path: Path, color: str) -> str | None:
     calibrations = _topics(index, CALIBRATIONS)
     beside = [t for t in calibrations if is_beside(t, color)]
     others = [t for t in calibrations if _kind(t) not in ("depth", "infra")]
-    return _one(path, "camera", beside or others)
+    aligned = [t for t in calibrations if says_aligned(t, color)]
+    return _one(path, "camera", beside or others or aligned)
 
 
 def is_beside(calibration: str, color: str) -> bool:

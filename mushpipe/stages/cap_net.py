@@ -81,7 +81,7 @@ class CapNet(Stage):
     def _ordered(self) -> Self:
         smallest, largest = self.radius_px
         if smallest >= (largest or _KNOWN[1]):
-            raise ValueError("radius_px must be [smallest, largest]")
+            raise ValueError("radius_px must be [smallest, largest], the first below the second")
         if _scale_for(smallest, largest or _KNOWN[1]) > _LARGEST_SCALE:
             raise ValueError("radius_px lies below what an image shows of a cap; is it in px?")
         return self

@@ -128,7 +128,7 @@ class PhaseHough(Stage):
         for name in ("radius_px", "diameter_mm"):
             value = getattr(self, name)
             if value is not None and value[0] >= (value[1] or _LARGE):
-                raise ValueError(f"{name} must be [smallest, largest]")
+                raise ValueError(f"{name} must be [smallest, largest], the first below the second")
         if self.diameter_mm[1] < 1:
             raise ValueError("diameter_mm is in mm, and below 1 mm: was it given in m?")
         return self

@@ -20,7 +20,7 @@ def test_a_recording_is_never_written_over_by_its_own_run(folder: Path) -> None:
         *("run", "graph.yaml", "--source", "a.mcap", "--set", "log.path=./a.mcap"), cwd=folder
     )
     assert done.returncode == EXIT_USAGE
-    assert "sink 'log' would write over what the run reads" in done.stderr
+    assert "sink 'log' would write over what is read" in done.stderr
     assert (folder / "a.mcap").read_bytes() == before
 
 
@@ -94,7 +94,7 @@ def test_a_sink_of_ones_own_is_kept_from_its_source_by_the_type_of_its_path(fold
     before = (folder / "a.mcap").read_bytes()
     done = mushpipe("run", "graph.yaml", "--source", "a.mcap", cwd=folder)
     assert done.returncode == EXIT_USAGE
-    assert "sink 'mine' would write over what the run reads" in done.stderr
+    assert "sink 'mine' would write over what is read" in done.stderr
     assert (folder / "a.mcap").read_bytes() == before
 
 

@@ -88,7 +88,8 @@ BROKEN = {
     ),
     "two documents": (
         "a: 1\n---\nb: 2\n",
-        """g.yaml:2:1: not valid YAML: but found another document
+        "g.yaml:2:1: not valid YAML: expected a single document in the stream, "
+        """but found another document
     ---
     ^""",
     ),

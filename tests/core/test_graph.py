@@ -145,9 +145,10 @@ FAULTS = {
     a space after the colon, as in 'use: name'""",
     ),
     "an entry that is no mapping": (
-        stage("threshold"),
-        """graph.yaml:4:8: stages.seg: Input should be an object, got "threshold"
-      seg: threshold
+        stage("invert"),
+        "graph.yaml:4:8: stages.seg: expected settings in braces, such as {use: otsu}, "
+        """got "invert"
+      seg: invert
            ^""",
     ),
     "inputs that are no mapping": (

@@ -78,9 +78,13 @@ def test_a_file_that_is_not_there_or_a_folder(tmp_path):
     with pytest.raises(UsageError) as caught:
         RecordingReader(tmp_path / "x.mcap")
     assert str(caught.value) == f"{tmp_path}/x.mcap: there is no such recording"
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(UsageError) as caught:
         RecordingReader(tmp_path)
-    assert str(caught.value) == f"{tmp_path}: cannot be read: Is a directory"
+    assert str(caught.value) == f"{tmp_path}: it is a folder, in which no recording is"
+    (tmp_path / "bag_0.mcap").touch()
+    with pytest.raises(UsageError) as caught:
+        RecordingReader(tmp_path)
+    assert str(caught.value).endswith(f"a recording is a file: {tmp_path}/bag_0.mcap")
 
 
 def records(data: bytes) -> list[tuple[int, int, int]]:

@@ -221,9 +221,11 @@ class BadCircle(Stage):
         return circles(3, -1)
 
 
+_COPY = "frames and tables belong to all stages: copy an array before changing it"
+
 FAILURES = {
-    "writes into the frame": (Writes, "ValueError: assignment destination is read-only"),
-    "writes into the mask": (WritesMask, "ValueError: output array is read-only"),
+    "writes into the frame": (Writes, f"ValueError: assignment destination is read-only; {_COPY}"),
+    "writes into the mask": (WritesMask, f"ValueError: output array is read-only; {_COPY}"),
     "returns nothing": (Forgets, "TypeError: it returned (NoneType), declared is (Mask)"),
     "returns another order": (
         ReturnsAnother,

@@ -263,7 +263,7 @@ def test_a_missing_file_is_a_mistake_of_the_user(tmp_path: Path) -> None:
 
 
 def test_a_folder_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="cannot be read: Is a directory"):
+    with pytest.raises(UsageError, match="it is a folder, in which no recording is"):
         play(tmp_path)
 
 

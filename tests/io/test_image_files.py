@@ -212,7 +212,7 @@ def test_what_is_no_depth_is_refused_by_name(
 
 def test_depth_is_no_colour_and_a_damaged_file_no_image(tmp_path: Path) -> None:
     write(tmp_path / "0.png", 400, np.uint16, 1)
-    with pytest.raises(InputError, match=r"0\.png: color is uint16"):
+    with pytest.raises(InputError, match=r"0\.png: 16 bits a channel, expected 8; where it is"):
         played(tmp_path)
     (tmp_path / "0.png").write_bytes(b"")
     with pytest.raises(InputError, match=r"0\.png: it is no image, or damaged"):

@@ -176,7 +176,7 @@ def test_frames_come_as_they_were_sent(tmp_path: Path) -> None:
     ("content", "message"),
     [
         (b"", "standard input is empty: see what its sender says"),
-        (b"\x89MCAP0", "standard input is empty: see what its sender says"),
+        (b"\x89MCAP0", "standard input ends after 6 bytes: see what its sender says"),
         (b"mushpipe: 1\nsource: synthetic\n", "standard input is not MCAP: send it with -o -"),
     ],
 )
