@@ -27,13 +27,15 @@ STEP = 0.5  # px between places on a line
 WIDE = int(1.0 / STEP)  # steps to either side that a slope is taken over
 REACH = 12  # steps to either side that are looked at, at most
 EDGE = 1.01  # px, from a last place to the image's, rounding of single precision included
+FAINT = 0.4  # share of the luma inside by which it falls; with less a rim may be darker than both
 LEAST_STEP = 0.04  # of luma, between 1 px inside and 1 px outside
 # Rows of DIRECTIONS in the room to work in. First how far the outline lies, px, 0 where it is not
 # looked for; then room for `expected_reach`, then for lines across it: first place, step, shares of
 # the next pixels, four pixels; then the luma by steps. `find_steepest` puts its finds in place of
-# the first places: by how much the luma falls at most, weighted, and at which step.
+# the first places: by how much the luma falls at most, weighted, and at which step; and in place of
+# the steps the sign of the change.
 X, Y, DX, DY, FX, FY, CORNERS = (k * DIRECTIONS for k in range(1, 8))
-BEST, PLACE, LINES = X, Y, CORNERS + 4 * DIRECTIONS
+BEST, PLACE, SIGN, LINES = X, Y, DX, CORNERS + 4 * DIRECTIONS
 LANES_ROOM = LINES + (2 * REACH + 1) * DIRECTIONS
 Lanes = tuple[Singles, Ints32]  # (LANES_ROOM,) and (2 DIRECTIONS,)
 
@@ -130,7 +132,7 @@ def place_lines(
 
 @borrower
 def look_along(gray: Singles, count: int, row: Singles, pixels: Ints32) -> float:
-    """Fill the luma along the lines, bilinear; return how much it falls along all of them.
+    """Fill the luma along the lines, bilinear; return its fall along all, as share of the inside.
 
     Args:
         gray: (H, W) luma, at least 2 by 2.
@@ -157,10 +159,11 @@ def look_along(gray: Singles, count: int, row: Singles, pixels: Ints32) -> float
             c, d = row[j + CORNERS + 2 * DIRECTIONS], row[j + CORNERS + 3 * DIRECTIONS]
             up, low = a + row[j + FX] * (b - a), c + row[j + FX] * (d - c)
             row[j + step] = up + row[j + FY] * (low - up)
-    contrast, last = none, LINES + (count - 1) * DIRECTIONS
+    inside, outside, last = none, none, LINES + (count - 1) * DIRECTIONS
     for j in range(DIRECTIONS):
-        contrast += row[j + LINES] - row[j + last] if row[j] > none else none
-    return float(contrast)
+        inside += row[j + LINES] if row[j] > none else none
+        outside += row[j + last] if row[j] > none else none
+    return float(inside - outside) / max(float(inside), 1e-6)
 
 
 @borrower
@@ -173,7 +176,7 @@ def find_steepest(row: Singles, count: int, sign: float) -> None:
         sign: Of what is looked for.
     """
     for j in range(DIRECTIONS):
-        row[j + BEST], row[j + PLACE] = Single(0), Single(-1)
+        row[j + BEST], row[j + PLACE], row[j + SIGN] = Single(0), Single(-1), Single(sign)
     for k in range(WIDE, count - WIDE):
         # of two equal steps the nearer one to where it is expected
         weight = Single(sign * (1.0 - 0.4 * abs(k - 0.5 * (count - 1)) / (0.5 * count)))
@@ -183,6 +186,23 @@ def find_steepest(row: Singles, count: int, sign: float) -> None:
             better = fall > row[j + BEST]
             row[j + BEST] = fall if better else row[j + BEST]
             row[j + PLACE] = Single(step) if better else row[j + PLACE]
+
+
+@borrower
+def find_sharpest(row: Singles, count: int) -> None:
+    """Find where the luma changes most steeply in each direction, whether it falls or rises.
+
+    Arguments as `find_steepest`. The rim of a cap is darker than its middle; where what is outside
+    is as bright as that, the outline is the other side of the rim, and the sharper one.
+    """
+    find_steepest(row, count, 1.0)
+    for j in range(DIRECTIONS):
+        row[j + FX], row[j + FY] = row[j + BEST], row[j + PLACE]
+    find_steepest(row, count, -1.0)
+    for j in range(DIRECTIONS):
+        falls = row[j + FX] > row[j + BEST]
+        row[j + PLACE] = row[j + FY] if falls else row[j + PLACE]
+        row[j + SIGN] = Single(1) if falls else Single(-1)
 
 
 @borrower
@@ -236,12 +256,15 @@ def sample_outline(
     half = min(REACH, max(5, int(0.2 * circle[2] / STEP)))
     count = 2 * half + 1
     place_lines(image.ranks, rank, circle, half, row, pixels)
-    sign = 1.0 if look_along(gray, count, row, pixels) > 0 else -1.0
-    find_steepest(row, count, sign)
+    contrast = look_along(gray, count, row, pixels)
+    if abs(contrast) < FAINT:
+        find_sharpest(row, count)
+    else:
+        find_steepest(row, count, 1.0 if contrast > 0 else -1.0)
     for j in range(DIRECTIONS):
         if row[j] == 0.0:
             continue
-        step, fall = vertex(row, j, count, sign)
+        step, fall = vertex(row, j, count, row[j + SIGN])
         if step < 0.0 or fall < LEAST_STEP:
             continue
         reach = row[j] + (step - half) * STEP

@@ -21,6 +21,7 @@ from tests.stages.caps import (
     draw,
     draw_pointed,
     frame_from,
+    frame_of,
 )
 
 EXACT = {"depth_noise_mm": 0.02, "depth_noise_per_m": 0.0, "edge_offset_px": 0.0, "tilt_deg": 60}
@@ -123,6 +124,34 @@ def test_a_high_pointed_cap_that_leans_is_not_taken_for_a_small_upright_one(powe
     locations, poses, _ = stage.process(frame_from(depth, gray), Circles([[x, y]], [radius], [1.0]))
     assert angle(poses.axis[0], true.axis) < 3
     assert locations.diameter[0] == pytest.approx(0.044, abs=2e-3)
+
+
+@pytest.mark.parametrize("ground", [0.55, 0.6, 0.65, 0.7])
+@pytest.mark.parametrize("ambient", [0.3, 0.45])
+def test_a_darker_rim_on_ground_as_bright_as_the_cap_makes_it_no_smaller(
+    ground: float, ambient: float
+) -> None:
+    """Lambert's law under a lamp aside: the steepest fall is inside, the outline is where it ends.
+
+    The rim where the fall was taken for the outline made diameters 1.5 to 2.1 mm too small.
+    """
+    lamp = np.array([0.6, 0.3, 1.0]) / np.sqrt(1.45)
+    errors = []
+    for tilt, turn in [(0, 0), (10, 40), (20, 200), (25, 300)]:
+        c = cap(tilt, turn, (0.0, 0.0, 0.3), 0.022, 0.6)
+        depth, cover = draw([c], 0.34)
+        share = (cover - 0.2) / 0.6  # of caps; the bed has the rest
+        v, u = np.mgrid[: CAMERA.height, : CAMERA.width].astype(float)
+        points = CAMERA.deproject(np.stack([u, v], axis=-1), depth)
+        axes = np.array([c.radius, c.radius, c.height])
+        normal = ((points - c.center) @ frame_of(c.axis) / axes**2) @ frame_of(c.axis).T
+        normal /= np.linalg.norm(normal, axis=2, keepdims=True)
+        lit = 0.85 * (ambient + (1 - ambient) * np.clip(-(normal @ lamp), 0, 1))
+        flat = ground * (ambient + (1 - ambient) * lamp[2])
+        luma = np.clip(share * lit + (1 - share) * flat, 0, 1)
+        found, _, _ = CapFit(edge_offset_px=0).process(frame_from(depth, luma), circles_of([c]))
+        errors.append(1e3 * (found.diameter[0] - 2 * c.radius))
+    assert abs(np.mean(errors)) < 0.7
 
 
 def test_an_outline_that_no_depth_edge_confirms_widens_the_sigmas() -> None:
