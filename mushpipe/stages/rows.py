@@ -28,7 +28,7 @@ def require_same_rows(
     """
     n = len(circles)
     if not n == len(locations) == len(poses):
-        counts = f"{n} circles, {len(locations)} locations and {len(poses)} poses"
+        counts = f"{n} circles, {len(locations)} locations, {len(poses)} poses"
         raise ValueError(f"{counts}: {_ONE_CHAIN}")
     if camera is None:
         return
