@@ -8,7 +8,7 @@ from typing import Any
 
 from mushpipe.core.errors import InputError
 from mushpipe.core.geometry import Camera
-from mushpipe.sources.images import decode_camera, distortion
+from mushpipe.sources.images import GIVEN_CAMERA, decode_camera, distortion
 from mushpipe.sources.recorded import RecordedSource
 from mushpipe.sources.topics import Topics, is_beside
 
@@ -94,7 +94,8 @@ class Calibration:
         if camera is not None and (camera.height, camera.width) != size:
             raise InputError(
                 f"the image ({self.color}) is {size[1]}x{size[0]}, its calibration ({self.topic}) "
-                f"for {camera.width}x{camera.height}: {_OTHER_SIZE}"
+                f"for {camera.width}x{camera.height}: name that of these images (--set "
+                f"source.camera_topic=), or set {GIVEN_CAMERA}"
             )
         return camera
 
@@ -106,9 +107,5 @@ class Calibration:
             raise InputError(
                 f"the only calibration ({self.topic}) is of frame '{self._frame_id}', "
                 f"colour is in '{frame_id}': name it if it holds for colour (--set "
-                f"source.camera_topic={self.topic}), or {_SET_CAMERA}"
+                f"source.camera_topic={self.topic}), or set {GIVEN_CAMERA}"
             )
-
-
-_SET_CAMERA = "set source.camera: {fx: , fy: , cx: , cy: }"
-_OTHER_SIZE = f"name that of these images (--set source.camera_topic=), or {_SET_CAMERA}"

@@ -149,6 +149,7 @@ def _decode_compressed_depth(message: Any, scale: float | None) -> tuple[NDArray
     return metres, _known_scale(scale, 1.0, "32FC1")
 
 
+GIVEN_CAMERA = "source.camera: {fx: , fy: , cx: , cy: }"
 _LENGTHS = (4, 5, 8, 12, 14)  # of coefficients that OpenCV has
 
 
@@ -183,8 +184,7 @@ def decode_camera(message: Any, rectified: bool) -> Camera | None:
         raise ValueError(f"its matrix is no fx 0 cx, 0 fy cy, 0 0 1, but {[float(v) for v in k]}")
     if not (message.width and message.height):
         raise ValueError(
-            f"a calibration for images of {message.width}x{message.height} px: give source.camera: "
-            "{fx: , fy: , cx: , cy: }"
+            f"a calibration for images of {message.width}x{message.height} px: give {GIVEN_CAMERA}"
         )
     model: str = "none"
     coefficients: tuple[float, ...] = ()
@@ -218,7 +218,7 @@ def _of_part(camera: Camera, message: Any) -> Camera:
     if left + width > camera.width or top + height > camera.height:
         raise ValueError(
             f"its roi, {width}x{height} from ({left}, {top}) on, lies beyond its image of "
-            f"{camera.width}x{camera.height}: set source.camera: {{fx: , fy: , cx: , cy: }}"
+            f"{camera.width}x{camera.height}: set {GIVEN_CAMERA}"
         )
     return replace(
         camera,

@@ -8,6 +8,7 @@ import numpy as np
 
 from mushpipe import Circles
 from mushpipe.core.arrays import Bools
+from mushpipe.stages.discs import LIKELY
 
 logger = logging.getLogger("mushpipe")
 EACH = 15  # frames, of which one is looked at
@@ -34,7 +35,7 @@ class Contradiction:
 
         Args:
             number: Of the frame.
-            circles: Those that are likely by depth and colour together.
+            circles: By depth and colour together; the likely ones count.
             unseen: (N,) of which of them the network sees nothing.
             learned: Circles of the network.
         """
@@ -42,7 +43,8 @@ class Contradiction:
         if self._told or self._frames % EACH != 1:
             return
         sure = learned.take(learned.score >= SURE)
-        alone = int(unseen.sum())
+        likely = circles.score >= LIKELY
+        circles, alone = circles.take(likely), int(unseen[likely].sum())
         if len(circles) >= ENOUGH and alone > MOST * len(circles):
             self._told = True
             logger.warning(

@@ -173,9 +173,7 @@ class PhaseHough(Stage):
             return circles
         if found.relief.known:
             unseen = found.table[order, AT_LEARNED] == 0
-            likely = score >= LIKELY
-            parts = circles.take(likely), unseen[likely], found.learned
-            self._contradiction.look(frame.header.sequence, *parts)
+            self._contradiction.look(frame.header.sequence, circles, unseen, found.learned)
             return certain_first(without_clods(frame.color, circles, unseen))
         sure = found.learned.take(found.learned.score >= max(_SURE, self.min_score))
         radius = equal_area_radius(found.shapes)

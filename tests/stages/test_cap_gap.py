@@ -115,17 +115,22 @@ def test_depth_that_is_not_aligned_to_colour_is_told_of(caplog: pytest.LogCaptur
     assert "px to the left" in message
 
 
-@pytest.mark.parametrize("right", [0, -3, -5, 5])
-def test_shadows_beside_all_caps_keep_nobody_from_telling(
-    right: int, caplog: pytest.LogCaptureFixture
-) -> None:
+def look_at_beds(count: int, right: int) -> None:
+    """Let a watch look at so many beds, with depth so many px to the right of colour."""
     watch = EdgeWatch()
-    for seed in range(9000, 9006):
+    for seed in range(9000, 9000 + count):
         frame = simulated(seed, width=640, height=480, count=80)
         truth = frame.attached[TRUTH_TOPIC].take(frame.attached[TRUTH_TOPIC].ignore == 0)
         assert frame.depth is not None
         seen = replace(frame, depth=np.roll(frame.depth, right, axis=1))
         watch.look(seen, Circles(truth.center, truth.radius, np.ones(len(truth))), 0.7)
+
+
+@pytest.mark.parametrize("right", [0, -3, -5, 5])
+def test_shadows_beside_all_caps_keep_nobody_from_telling(
+    right: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    look_at_beds(6, right)
     found = [re.search(r"([\d.]+) px to the (left|right)", text) for text in caplog.messages]
     told = [float(f[1]) * (1 if f[2] == "right" else -1) for f in found if f]
     assert len(told) == len(found) == (right != 0)
@@ -137,13 +142,7 @@ def test_depth_far_beside_colour_is_told_of_as_well(
     right: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Farther than edges are looked for."""
-    watch = EdgeWatch()
-    for seed in range(9000, 9010):
-        frame = simulated(seed, width=640, height=480, count=80)
-        truth = frame.attached[TRUTH_TOPIC].take(frame.attached[TRUTH_TOPIC].ignore == 0)
-        assert frame.depth is not None
-        seen = replace(frame, depth=np.roll(frame.depth, right, axis=1))
-        watch.look(seen, Circles(truth.center, truth.radius, np.ones(len(truth))), 0.7)
+    look_at_beds(10, right)
     (message,) = caplog.messages
     assert "not aligned to colour" in message
 
