@@ -4,7 +4,13 @@ This module is what a plugin author needs.
 """
 
 import mushpipe.core.interrupt  # noqa: F401 - before what takes long to import
-from mushpipe.core.errors import InputError, MushpipeError, UsageError
+from mushpipe.core.errors import (
+    DependencyError,
+    DeviceError,
+    InputError,
+    MushpipeError,
+    UsageError,
+)
 from mushpipe.core.geometry import Camera, quaternion_from_axis
 from mushpipe.core.paths import GraphPath, SinkPath
 from mushpipe.core.plugins import Registry, hookimpl
@@ -25,7 +31,9 @@ __all__ = [
     "Camera",
     "Circles",
     "Columns",
+    "DependencyError",
     "DepthSource",
+    "DeviceError",
     "GraphPath",
     "Header",
     "InputError",

@@ -22,36 +22,39 @@ _FEWEST_LEVELS = 6
 _FEWEST_EACH = 8  # depths a level: unlike steps, chance seldom meets a level twice
 
 
-def judged(frames: Iterator[RgbdFrame], name: str) -> Iterator[RgbdFrame]:
+def judged(frames: Iterator[RgbdFrame], name: str, live: bool) -> Iterator[RgbdFrame]:
     """Pass frames on, and warn of the first that has depth where that is odd.
 
-    And, once, where depth stands still: noise lets no sensor give the same image twice.
+    And, once, where depth stands still: noise lets no sensor give the same image twice. Colour must
+    go on meanwhile, unless they are live: a recording of one picture may be played in a loop.
     """
-    done, last, same = False, None, 0
+    done, last, same, moved = False, None, 0, False
     for frame in frames:
         done = done or _warned(name, frame)
-        same = same + 1 if last is not None and _stands_still(frame, last) else 0
+        still = last is not None and _stands_still(frame, last)
+        changed = still and last is not None and not np.array_equal(frame.color, last.color)
+        same, moved = (same + 1, moved or changed) if changed or (still and live) else (0, False)
         if same == STILL:
             logger.warning(
-                "%s, frame %d: depth has been the same, to the last digit, for %d frames in which "
-                "colour changed: its sensor or driver may have stopped, and positions are of then",
+                "%s, frame %d: depth has been the same, to the last digit, for %d frames%s: its "
+                "sensor or driver may have stopped, and positions are of then",
                 *(name, frame.header.sequence, same),
+                " in which colour changed" if moved else ", and so has colour",
             )
         last = frame
         yield frame
 
 
 def _stands_still(frame: RgbdFrame, last: RgbdFrame) -> bool:
-    """Return whether depth, of which some is known, is the same as before, and colour is not."""
+    """Return whether depth, of which some is known, is the same as before."""
     depth, before = frame.depth, last.depth
-    if depth is None or before is None or depth.shape != before.shape:
+    if depth is None or before is None:
         return False
     few = depth[::_APART, ::_APART]
-    return bool(
-        np.array_equal(few, before[::_APART, ::_APART])
-        and np.array_equal(depth, before)
-        and depth.any()
-        and not np.array_equal(frame.color, last.color)
+    return (
+        np.array_equal(few, before[::_APART, ::_APART], equal_nan=True)
+        and np.array_equal(depth, before, equal_nan=True)
+        and bool((depth > 0).any())
     )
 
 

@@ -238,7 +238,8 @@ class SourceThread(threading.Thread):
             raise TypeError(f"its frames() gave {frames!r}, expected frames, as by yield")
         timed_frames = timed(frames, self.durations)
         try:
-            seen = judged(paced(timed_frames, speed, self.stop), self.source.name())
+            steady = paced(timed_frames, speed, self.stop)
+            seen = judged(steady, self.source.name(), self.source.live)
             for frame in limited(seen, self.source):
                 if self.stop.is_set() or not self.box.put((frame, time.perf_counter_ns())):
                     break

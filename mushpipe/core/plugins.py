@@ -87,7 +87,6 @@ class Broken:
     distribution: str
     version: str
     reason: str
-    details: str = ""
 
 
 @dataclass
@@ -212,9 +211,7 @@ def register(registry: Registry, points: Iterable[EntryPoint]) -> None:
             if sum(map(len, registry.entries.values())) == before:
                 raise PluginError("it registers nothing: is @mushpipe.hookimpl missing?")
         except (Exception, SystemExit) as error:
-            registry.broken.append(
-                Broken(point.name, distribution, version, _brief(error), traceback.format_exc())
-            )
+            registry.broken.append(Broken(point.name, distribution, version, _brief(error)))
             if module is not None and manager.is_registered(module):
                 manager.unregister(module)  # else its fault would be found again with the next one
 

@@ -144,7 +144,9 @@ def encode_depth(frame: RgbdFrame) -> Message:
     if frame.depth.dtype == np.float32:
         encoding = "32FC1"
     else:
-        encoding = "16UC1" if frame.depth_scale == 0.001 else "mono16"
+        # RealSense states its scale in single precision
+        millimetres = np.float32(frame.depth_scale) == np.float32(0.001)
+        encoding = "16UC1" if millimetres else "mono16"
     data = encode_image(frame.depth, encoding, frame.header)
     metadata = {"depth_scale": repr(float(frame.depth_scale))}
     return Message("", foxglove_schema("RawImage"), data, metadata)

@@ -45,17 +45,24 @@ class RobotClient:
         self._asked = 0, begun_ms  # the last request's id, and when it was made; 0 is hello's
         self._ahead_ms = math.inf  # our clock, before the server's t_ms
         self.late_ms = 0.0
-        self.hello = self.receive()
-        if self.hello["op"] == "hello" and not str(self.hello.get("version")).startswith("1."):
+        try:
+            self.hello = self._greet(mode=mode, **hello)
+        except BaseException:
             self.close()
+            raise
+
+    def _greet(self, **hello: Any) -> Message:
+        """Return the server's hello, after it has taken ours."""
+        first = self.receive()
+        if first["op"] == "hello" and not str(first.get("version")).startswith("1."):
             raise PermissionError(
-                f"the server speaks version {self.hello.get('version')}, this client 1.0"
+                f"the server speaks version {first.get('version')}, this client 1.0"
             )
-        self.send("hello", version="1.0", mode=mode, **hello)
-        first = self.hello if self.hello["op"] == "error" else self.receive()
-        if first["op"] == "error":
-            self.close()
-            raise PermissionError(f"{first['code']}: {first['message']}")
+        self.send("hello", version="1.0", **hello)
+        taken = first if first["op"] == "error" else self.receive()
+        if taken["op"] == "error":
+            raise PermissionError(f"{taken['code']}: {taken['message']}")
+        return first
 
     def send(self, op: str, **fields: Any) -> None:
         """Send a line."""
@@ -100,9 +107,13 @@ class RobotClient:
         return self._id
 
     def targets(self, **fields: Any) -> list[Message]:
-        """Return what may be picked now, best first; nothing where the server has nothing fresh."""
-        found: list[Message] = self.ask("get_targets", **fields).get("targets", [])
-        return found
+        """Return what may be picked now, best first.
+
+        Nothing where the server has nothing fresh, or its answer was too long on the way.
+        """
+        answer = self.ask("get_targets", **fields)
+        found: list[Message] = answer.get("targets", [])
+        return found if self.late_ms < answer.get("valid_ms", math.inf) else []
 
     def ack(self, target: str, result: str, **fields: Any) -> bool:
         """Tell what the robot does with a target; only True allows it to go on."""

@@ -52,8 +52,8 @@ class Ledger:
 
         Raises:
             Refusal: `conflict` where another robot holds the target, `unknown_target` where it is
-                neither visible nor held, or accepted unseen after it was put off, `busy` where too
-                many are held.
+                neither visible nor held, accepted unseen after it was put off, or accepted though
+                it is done, `busy` where too many are held.
         """
         self.settle(now)
         entry = self._entries.get(target)
@@ -64,6 +64,8 @@ class Ledger:
         if holder not in (None, owner):
             raise Refusal("conflict", f"m{target} is held, or done, by another robot")
         if target in self._done:
+            if outcome == "accepted":
+                raise Refusal("unknown_target", f"m{target} is done")
             return "removed"  # for good, whatever is said later
         held = outcome == "accepted" or (outcome != "done" and hold_s > 0)
         if held and entry is None and len(self._entries) >= MOST_ENTRIES:

@@ -114,7 +114,7 @@ class RobotServer:
             self._outer.send(b"w")
 
     def stop(self, reason: Ending = "end") -> None:
-        """Tell every client, close every socket, and wait for the thread; half a second at most."""
+        """Tell every client, close every socket, and wait for the thread, 2 s at most."""
         self._stopping = self._stopping or reason
         if self._thread.is_alive():
             self._poke()

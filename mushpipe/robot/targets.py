@@ -12,12 +12,13 @@ from typing import Any, Literal
 
 import numpy as np
 import orjson
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from mushpipe.core.arrays import Bools, Floats, Rows
 from mushpipe.core.geometry import axis_from_quaternion
 from mushpipe.core.group import Group
 from mushpipe.core.tables import AXIS_TOLERANCE, DepthSource, PickFlag, Picks
+from mushpipe.core.transform import REACH
 
 Reason = Literal["no_depth", "estimated", "invalid", "workspace", "claimed", "limit"]
 REASONS: tuple[Reason, ...] = ("no_depth", "estimated", "invalid", "workspace", "claimed", "limit")
@@ -37,6 +38,13 @@ class Workspace(Group):
 
     low: Vector = Field(description="corner with the smallest x, y, z, m")
     high: Vector = Field(description="corner with the largest x, y, z, m")
+
+    @field_validator("low", "high")
+    @classmethod
+    def _metres(cls, value: Vector) -> Vector:
+        if max(map(abs, value)) > REACH:
+            raise ValueError(f"it is in m, and more than {REACH:g} m away: was it given in mm?")
+        return value
 
     @model_validator(mode="after")
     def _not_empty(self) -> Workspace:

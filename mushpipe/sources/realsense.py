@@ -124,6 +124,11 @@ class RealsenseSource(ReplaySource):
         identity = device.info(self._link.profile.get_device())
         if identity.get("usb_type_descriptor", "").startswith("2"):
             logger.warning("the camera is on USB 2: use a USB 3 port and cable")
+        if "hole-filling" in self.filters:
+            logger.warning(
+                "source.filters: hole-filling invents depth, which counts as measured; with robots "
+                "leave it out"
+            )
 
     def describe(self) -> dict[str, Any]:
         """Return identity, streams, calibration and options, as the camera tells them."""

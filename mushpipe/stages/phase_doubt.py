@@ -27,20 +27,18 @@ class Contradiction:
     """Warns, once, where most caps of a frame are known to depth alone, or to the network alone."""
 
     def __init__(self) -> None:
-        self._frames = 0
         self._told = False
 
     def look(self, number: int, circles: Circles, unseen: Bools, learned: Circles) -> None:
         """Look at a frame.
 
         Args:
-            number: Of the frame.
+            number: Of the frame, by which it is chosen: two frames may be here at once.
             circles: By depth and colour together; the likely ones count.
             unseen: (N,) of which of them the network sees nothing.
             learned: Circles of the network.
         """
-        self._frames += 1
-        if self._told or self._frames % EACH != 1:
+        if self._told or number % EACH:
             return
         sure = learned.take(learned.score >= SURE)
         likely = circles.score >= LIKELY

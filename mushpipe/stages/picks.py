@@ -124,7 +124,7 @@ class MakePicks(Stage):
         poses = Poses.unknown(n) if poses is None else poses
         require_same_rows(circles, locations, poses, frame.camera)
         require_plausible(circles, locations, poses, frame.camera)
-        self._warn_of_inward(locations, poses, frame.header.sequence)
+        poses = self._outward(poses, locations, frame.header.sequence)
         self._total += n
         self._missing += int((locations.source == DepthSource.MISSING).sum())
         height, width = frame.color.shape[:2]
@@ -152,18 +152,20 @@ class MakePicks(Stage):
         self._left_out += n - len(chosen)
         return picks.take(chosen)
 
-    def _warn_of_inward(self, locations: Locations, poses: Poses, sequence: int) -> None:
-        """Say once where a robot would be told to come from below."""
+    def _outward(self, poses: Poses, locations: Locations, sequence: int) -> Poses:
+        """Return the poses; unknown, which is said once, where a robot would come from below."""
         away = np.einsum("ij,ij->i", poses.axis, locations.position) > 0
-        if away.any() and not self._inward:
+        if not away.any():
+            return poses
+        if not self._inward:
             self._inward = True
             logger.warning(
-                "frame %d: %d of %d axes point away from the camera, which sees the caps: an axis "
-                "points out of its cap, and a robot comes from there",
-                sequence,
-                away.sum(),
-                poses.valid.sum(),
+                "frame %d: %d of %d axes point away from the camera, which sees the caps; these "
+                "poses are left out: an axis points out of its cap, and a robot comes from there",
+                *(sequence, away.sum(), poses.valid.sum()),
             )
+        n = len(poses)
+        return poses.joined(Poses.unknown(1)).take(np.where(away, n, np.arange(n)))
 
     def _flags(
         self,
@@ -176,6 +178,7 @@ class MakePicks(Stage):
         reach, tilt_sigma = circles.radius[:, None], np.radians(self.tilt_sigma_deg)
         cut = (circles.center < reach) | (circles.center + reach > np.array(image) - 1)
         flags = np.zeros(len(circles), np.uint32)
+        located, above = locations.source != DepthSource.MISSING, self._above(locations)
         for flag, where in (
             (PickFlag.DEPTH_MISSING, locations.source == DepthSource.MISSING),
             (PickFlag.DEPTH_ESTIMATED, locations.source == DepthSource.NEIGHBOURS),
@@ -185,7 +188,7 @@ class MakePicks(Stage):
             (PickFlag.TILT_UNOBSERVABLE, poses.valid & ~(poses.sigma_rad < tilt_sigma)),
             (
                 PickFlag.TOO_CLOSE_TO_NEIGHBOUR,
-                1000 * clearance(circles, locations, self._above(locations)) < self.clearance_mm,
+                located & ~(1000 * clearance(circles, locations, above) >= self.clearance_mm),
             ),
         ):
             flags[where] |= np.uint32(flag)

@@ -99,14 +99,26 @@ def test_any_source_is_told_once_of_units_that_cannot_be(
 
 
 @pytest.mark.parametrize(
-    ("still", "color_moves", "said"),
-    [(True, True, True), (True, False, False), (False, True, False)],
+    ("still", "color_moves", "live", "said"),
+    [
+        (True, True, False, "for 30 frames in which colour changed: "),
+        (True, True, True, "for 30 frames in which colour changed: "),
+        (True, False, True, "for 30 frames, and so has colour: "),
+        (True, False, False, None),
+        (False, True, True, None),
+    ],
 )
-def test_depth_that_stands_still_while_colour_goes_on_is_told_of_once(
-    still: bool, color_moves: bool, said: bool, caplog: pytest.LogCaptureFixture
-) -> None:
+@pytest.mark.parametrize("kind", ["16UC1", "32FC1", "nothing known"])
+def test_depth_that_stands_still_is_told_of_once(
+    kind: str, still: bool, color_moves: bool, live: bool, said: str | None,
+    caplog: pytest.LogCaptureFixture,
+) -> None:  # fmt: skip
     rng = np.random.default_rng(0)
     first = rng.integers(3000, 3200, (48, 64), np.uint16)
+    if kind != "16UC1":  # missing is NaN there
+        first = first.astype(np.float32)
+        first[::2] = np.nan
+        first[:, :] = np.nan if kind == "nothing known" else first
 
     def frames() -> Iterator[RgbdFrame]:
         for number in range(100):
@@ -116,6 +128,11 @@ def test_depth_that_stands_still_while_colour_goes_on_is_told_of_once(
                 depth[7, 9] += number % 2
             yield RgbdFrame(Header(number, number, "camera"), color, depth, 0.000125)
 
-    assert len(list(judged(frames(), "bed.mcap"))) == 100
+    assert len(list(judged(frames(), "bed.mcap", live))) == 100
     told = [text for text in caplog.messages if "depth has been the same" in text]
-    assert [text.split(":")[0] for text in told] == [f"bed.mcap, frame {STILL}"] * said
+    if said is None or kind == "nothing known":
+        assert not told
+    else:
+        (text,) = told
+        assert text.startswith(f"bed.mcap, frame {STILL}: ")
+        assert said in text

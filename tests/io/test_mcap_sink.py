@@ -86,7 +86,12 @@ def test_images_are_foxglove_images_with_the_times_of_the_frame(tmp_path: Path) 
 
 @pytest.mark.parametrize(
     ("scale", "dtype", "encoding"),
-    [(0.001, np.uint16, "16UC1"), (0.000125, np.uint16, "mono16"), (1.0, np.float32, "32FC1")],
+    [
+        (0.001, np.uint16, "16UC1"),
+        (float(np.float32(0.001)), np.uint16, "16UC1"),  # as librealsense states it
+        (0.000125, np.uint16, "mono16"),
+        (1.0, np.float32, "32FC1"),
+    ],
 )
 def test_only_millimetres_are_called_16uc1(
     scale: float, dtype: type, encoding: str, tmp_path: Path

@@ -226,8 +226,8 @@ def test_of_two_cameras_the_serial_number_chooses():
         rig.source().open()
 
 
-def test_the_filters_of_librealsense_run_before_alignment():
-    """A hole in the depth image is there without the filter and closed with it."""
+def test_the_filters_of_librealsense_run_before_alignment(caplog):
+    """A hole in the depth image is there without the filter, and closed with it, which is said."""
     rig = Rig(depth=COLOR, shift=(0, 0, 0))
     holed = rig.images(0)
     holed["depth"][60, 80:84] = 0
@@ -235,6 +235,7 @@ def test_the_filters_of_librealsense_run_before_alignment():
     for name, number in (("none", 0), ("hole-filling", 1)):
         source = rig.source(filters=() if name == "none" else (name,))
         source.open()
+        assert ("hole-filling invents depth" in caplog.text) is (name == "hole-filling")
         rig.feed(number, holed)
         found[name] = next(source.frames()).depth
         source.close()

@@ -75,6 +75,8 @@ def test_targets_outside_the_workspace_are_withheld() -> None:
     assert choice.withheld["workspace"] == 2
     with pytest.raises(ValidationError, match="less than"):
         Workspace(low=(0, 0, 0), high=(1, 1, 0))
+    with pytest.raises(ValidationError, match="was it given in mm"):
+        Workspace(low=(-300, -300, 0), high=(300, 300, 800))
 
 
 def test_what_is_unknown_and_not_needed_is_null() -> None:

@@ -167,6 +167,38 @@ def test_the_reference_client_sees_what_a_slow_network_held_back() -> None:
     assert late - fresh >= 600
 
 
+@pytest.mark.parametrize(("after_ms", "still"), [(399, True), (401, False)])
+def test_the_reference_client_takes_no_targets_from_an_answer_that_was_too_long_on_the_way(
+    after_ms: float, still: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answer = {"op": "targets", "id": 1, "t_ms": 0, "valid_ms": 400, "targets": [{"id": "m1"}]}
+    lines: list[dict[str, Any]] = [
+        {"op": "hello", "version": "1.0", "t_ms": 0},
+        {"op": "heartbeat", "t_ms": 0},
+        answer,
+    ]
+    moments = iter([0.0, 0.0, 0.0, 0.0])  # of the connection, both greetings, and the request
+    monkeypatch.setattr(
+        "mushpipe.robot.client.time.monotonic", lambda: next(moments, after_ms / 1000)
+    )
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        threading.Thread(target=serve_lines, args=(listening, lines), daemon=True).start()
+        with RobotClient(port=listening.getsockname()[1]) as robot:
+            assert robot.targets() == ([{"id": "m1"}] if still else [])
+
+
+def test_a_client_that_is_not_greeted_closes_its_connection() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        nonsense: list[dict[str, Any]] = [{"no": "op"}]
+        server = threading.Thread(target=serve_lines, args=(listening, nonsense), daemon=True)
+        server.start()
+        with pytest.raises(ConnectionError, match="no robot socket") as caught:
+            RobotClient(port=listening.getsockname()[1])
+        server.join(10)  # until it hears the end
+    assert not server.is_alive()
+    assert caught.tb is not None  # which holds the client: nobody else closed it
+
+
 def test_a_stream_of_hours_over_clocks_that_drift_is_not_taken_for_late(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

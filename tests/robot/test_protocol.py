@@ -166,9 +166,11 @@ def test_what_is_done_is_removed_for_good_whatever_is_said_later() -> None:
     with bench(claim_s=5) as b, Peer(b.port) as peer:
         b.publish()
         peer.greet()
-        for number, result in enumerate(("done", "accepted", "failed")):
+        for number, result in enumerate(("done", "failed", "done")):
             answer = peer.ask("ack", id=number, target="m0", result=result)
             assert answer["effect"] == "removed"
+        again = peer.ask("ack", id=3, target="m0", result="accepted")
+        assert (again["code"], again["message"]) == ("unknown_target", "m0 is done")
         b.advance(6)
         b.publish()
         assert peer.targets() == ["m1", "m2"]

@@ -300,15 +300,21 @@ def test_a_camera_that_looks_up_is_told_of(
     assert ("the camera looks up along z of 'robot_base'" in caplog.text) is told
 
 
-def test_axes_into_the_bed_are_told_of_once(caplog: pytest.LogCaptureFixture) -> None:
-    stage, found = MakePicks(), locations(DepthSource.MEASURED)
-    axis = np.array([[0.0, 0.6, 0.8]])
-    one = np.ones(1)
-    poses = Poses(quaternion_from_axis(axis), axis, found.position, one, one, one > 0)
+def test_axes_into_the_bed_are_left_out_and_told_of_once(caplog: pytest.LogCaptureFixture) -> None:
+    stage, found = MakePicks(), locations(DepthSource.MEASURED, DepthSource.MEASURED)
+    axis, one = np.array([[0.0, 0.6, 0.8], [0.0, 0.6, -0.8]]), np.ones(2)
+    apex = found.position - 0.01 * np.array([0, 0, 1])
+    poses = Poses(quaternion_from_axis(axis), axis, apex, one, one, one > 0)
+    circles = circles_at((50, 50), (80, 50))
     with caplog.at_level(logging.WARNING, "mushpipe"):
         for _ in range(2):
-            stage.process(frame_of(np.zeros((120, 160))), circles_at((50, 50)), found, poses)
-    assert caplog.text.count("1 of 1 axes point away from the camera") == 1
+            picks = stage.process(frame_of(np.zeros((120, 160))), circles, found, poses)
+    assert caplog.text.count("1 of 2 axes point away from the camera") == 1
+    picks = picks.take(np.argsort(picks.id))
+    np.testing.assert_array_equal(picks.axis, [[NAN] * 3, axis[1]])
+    assert np.isnan(picks.quaternion[0]).all()
+    assert picks.position.tolist() == [found.position[0].tolist(), apex[1].tolist()]
+    assert [bool(f & PickFlag.POSE_UNKNOWN) for f in picks.flags] == [True, False]
 
 
 def test_the_end_of_a_run_says_how_many_were_left_out(caplog: pytest.LogCaptureFixture) -> None:
@@ -371,6 +377,13 @@ def test_a_neighbour_without_depth_takes_room_as_well() -> None:
         picks = picked(rows, clearance_mm=clearance)
         close = (picks.flags & PickFlag.TOO_CLOSE_TO_NEIGHBOUR) > 0
         assert close.tolist() == [flagged, False]
+
+
+def test_room_around_a_cap_of_unknown_size_is_not_free() -> None:
+    rows = [(40, 60, 0.5, NAN), (120, 60, 0.5, 0.04)]
+    picks = picked(rows, clearance_mm=1)
+    close = (picks.flags & PickFlag.TOO_CLOSE_TO_NEIGHBOUR) > 0
+    assert close[np.argsort(picks.id)].tolist() == [True, False]
 
 
 def test_a_tilt_that_is_a_guess_is_flagged() -> None:
