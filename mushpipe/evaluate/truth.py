@@ -11,14 +11,15 @@ from typing import Literal
 import numpy as np
 import orjson
 from pydantic import ValidationError
+from pydantic_core import ErrorDetails
 
 from mushpipe.core.arrays import Floats
-from mushpipe.core.errors import InputError, UsageError
+from mushpipe.core.errors import InputError, UsageError, suggest
 from mushpipe.core.recording import RecordingReader
 from mushpipe.core.truth import TRUTH_TOPIC, Truth
 from mushpipe.core.types import Header
 from mushpipe.core.wire import decode_table
-from mushpipe.evaluate.labels import EXAMPLE, Frame, parse_labels, truth_of
+from mushpipe.evaluate.labels import EXAMPLE, Cap, Frame, Labels, parse_labels, truth_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +133,7 @@ def truth_of_labels(path: Path) -> TruthSet:
     except FileNotFoundError:
         raise UsageError(f"{path}: there are no such labels") from None
     except ValidationError as error:
-        faults = [f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()]
+        faults = list(map(_fault, error.errors()))
         raise InputError("\n  ".join([f"{path}: not valid labels:", *faults[:20]])) from error
     except orjson.JSONDecodeError as error:  # a table (CSV), say
         text = f"{path}: no labels: not JSON ({error}); expected is {EXAMPLE}"
@@ -144,6 +145,14 @@ def truth_of_labels(path: Path) -> TruthSet:
             raise InputError(f"{path}: the frame of {key} {value} is labelled {times} times")
     frames = {_place(frame): _frame_truth(path, frame, labels.frame_id) for frame in labels.frames}
     return TruthSet(path.name, frames)
+
+
+def _fault(item: ErrorDetails) -> str:
+    place = ".".join(map(str, item["loc"]))
+    if item["type"] != "extra_forbidden":
+        return f"{place}: {item['msg'].removeprefix('Value error, ')}"
+    known = [name for kind in (Labels, Frame, Cap) for name in kind.model_fields]
+    return f"{place}: this is not known here; {suggest(str(item['loc'][-1]), known)}"
 
 
 def _place(frame: Frame) -> Place:

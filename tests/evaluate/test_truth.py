@@ -183,6 +183,10 @@ def test_conversion_leaves_the_own_format_alone() -> None:
             "frames.0.caps.0.ignore",
         ),
         (
+            {"mushpipe_labels": 1, "frames": [{"index": 0, "caps": [{"apex": [0, 0, 1]}]}]},
+            "frames.0.caps.0.apex: this is not known here; did you mean 'apex_m'",
+        ),
+        (
             {
                 "mushpipe_labels": 1,
                 "frames": [{"index": 4, "caps": [{"u": 1, "v": 1, "radius_px": 1, "id": 3}] * 2}],
