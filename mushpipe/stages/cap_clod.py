@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from mushpipe import Circles
-from mushpipe.core.arrays import Bools, Bytes, Floats, locked
+from mushpipe.core.arrays import Bools, Bytes, Floats, Ints, locked
 from mushpipe.core.jit import borrower
 from mushpipe.stages.cap_kin import DARK, UNIT, Kin, alike, write_tone
 from mushpipe.stages.discs import LIKELY, discs_of
@@ -43,50 +43,58 @@ def clods(color: Bytes, circles: Circles, kin: Kin) -> Bools:
     if not len(kin.sure):
         return np.zeros(len(circles), np.bool_)
     odd = 2 * alike(*kin, ODD) < len(kin.sure)
-    return off_ground(color, circles, kin.tones, odd) < ALIKE
+    return off_ground(kin.tones, ground_of(color, circles, odd)) < ALIKE
 
 
-def off_ground(
-    color: Bytes,
-    circles: Circles,
-    tones: Floats,
-    asked: Bools,
-    uneven: float = 0.0,
-) -> Floats:
-    """Return how far the tones of circles (N,) are from that of the ground around each.
-
-    NaN where it is not asked for, no ground is seen, or it is too dark to tell.
+def ground_of(color: Bytes, circles: Circles, asked: Bools) -> Floats:
+    """Return what the ground around circles looks like.
 
     Args:
         color: (H, W, 3) RGB.
         circles: As detected, with the scores of `phase-hough`.
-        tones: (N, 3) of `cap_kin.tones_of`.
         asked: (N,) of which circles.
-        uneven: Standard deviation of the brightness of the ground over its mean, from which on it
-            counts as ground.
+
+    Returns:
+        (N, 4) tone, as by `cap_kin.tones_of`, and standard deviation of the brightness over its
+        mean. NaN where it is not asked for, no ground is seen, or it is too dark to tell.
     """
-    ground = np.full((len(tones), 4), np.nan)
+    ground = np.full((len(circles), 4), np.nan)
     discs, likely = discs_of(circles), circles.score >= LIKELY
-    _grounds(locked(color, np.uint8), discs, asked, likely, ground)
-    ground[(ground[:, 0] < math.log(NIGHT + DARK)) | (ground[:, 3] < uneven)] = np.nan
-    return np.asarray(np.linalg.norm(tones - ground[:, :3] / UNIT, axis=1))
+    near = np.empty(len(discs), np.int64)
+    _grounds(locked(color, np.uint8), discs, asked, likely, near, ground)
+    ground[ground[:, 0] < math.log(NIGHT + DARK)] = np.nan
+    ground[:, :3] /= UNIT
+    return ground
+
+
+def off_ground(tones: Floats, ground: Floats) -> Floats:
+    """Return how far the tones (N, 3) of circles are from that of the ground (N, 4) around them."""
+    return np.asarray(np.linalg.norm(tones - ground[:, :3], axis=1))
+
+
+def darker(tones: Floats, level: float) -> Bools:
+    """Return which tones (N, 3 or more) are darker than a gray level."""
+    return np.asarray(tones[:, 0] < math.log(level + DARK) / UNIT[0])
 
 
 @borrower
 def _grounds(
-    color: Bytes, discs: Floats, asked: Bools, likely: Bools,
-    ground: Floats,
-) -> None:  # fmt: skip
-    """Write tone and unevenness (N, 4) of the ground around the discs (N, 3) that are asked for."""
+    color: Bytes, discs: Floats, asked: Bools, likely: Bools, near: Ints, ground: Floats
+) -> None:
+    """Write tone and unevenness (N, 4) of the ground around the discs (N, 3) that are asked for.
+
+    `near` (N,) is room to work in.
+    """
     height, width = color.shape[:2]
     for k in range(len(discs)):
         if not asked[k]:
             continue
+        count = _neighbours(k, discs, likely, near)
         red = green = blue = squares = seen = 0
         for s in range(len(RING)):
             x, y = discs[k, 0] + discs[k, 2] * RING[s, 0], discs[k, 1] + discs[k, 2] * RING[s, 1]
             u, v = math.floor(x + 0.5), math.floor(y + 0.5)
-            if 0 <= u < width and 0 <= v < height and _free(x, y, discs, likely):
+            if 0 <= u < width and 0 <= v < height and _free(x, y, discs, near[:count]):
                 red += int(color[v, u, 0])
                 green += int(color[v, u, 1])
                 blue += int(color[v, u, 2])
@@ -100,10 +108,22 @@ def _grounds(
 
 
 @borrower
-def _free(x: float, y: float, discs: Floats, likely: Bools) -> bool:
-    """Whether a point lies in none of the discs that may be caps, nor close to one."""
+def _neighbours(k: int, discs: Floats, likely: Bools, near: Ints) -> int:
+    """Write the rows of the discs that may be caps and reach the ground of one; return how many."""
+    count = 0
     for m in range(len(discs)):
+        apart = math.hypot(discs[k, 0] - discs[m, 0], discs[k, 1] - discs[m, 1])
+        if likely[m] and apart < _REACH[-1] * discs[k, 2] + CLEAR * discs[m, 2]:
+            near[count] = m
+            count += 1
+    return count
+
+
+@borrower
+def _free(x: float, y: float, discs: Floats, rows: Ints) -> bool:
+    """Whether a point lies in none of the discs of some rows, nor close to one."""
+    for m in rows:
         squared = (x - discs[m, 0]) ** 2 + (y - discs[m, 1]) ** 2
-        if likely[m] and squared < (CLEAR * discs[m, 2]) ** 2:
+        if squared < (CLEAR * discs[m, 2]) ** 2:
             return False
     return True

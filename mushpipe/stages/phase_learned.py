@@ -9,13 +9,14 @@ import numpy as np
 from mushpipe import Circles
 from mushpipe.core.arrays import Bools, Bytes, Floats, Ints32, Singles
 from mushpipe.core.jit import borrower, jit
-from mushpipe.stages.cap_clod import off_ground
-from mushpipe.stages.cap_kin import tones_of
+from mushpipe.stages.cap_clod import darker, ground_of, off_ground
+from mushpipe.stages.cap_kin import UNIT, tones_of
 from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE, Radii, certain_first, iou, lens
 
 _AROUND = 4.0  # px; a circle of a network is not more exact than that
 _SAME = 0.5  # IoU from which on an outline is that of a circle
 _GROUND = 1.5  # distance of tones up to which an unseen circle looks like the ground around it
+_EXACTLY, _SOIL = 0.5, 100.0  # and any on ground darker than this gray level: of 2695 caps one did
 _UNEVEN = 0.12  # spread of its brightness over the mean, below which ground holds no clods
 _OWN = 0.5  # share of a circle that none that was accepted may cover
 
@@ -54,11 +55,12 @@ def agreement(shapes: Floats, radius: Floats, learned: Circles) -> Floats:
 
 
 def without_clods(color: Bytes, circles: Circles, unseen: Bools) -> Circles:
-    """Return the circles but for those that the network sees nothing of and that look like ground.
+    """Return the circles but for those that look like the ground.
 
     A round clod has the form of a cap in depth as well. Caps that the network sees nothing of are
-    few, and do not look like what is around them. Even ground, such as a table, holds no clods, and
-    where the border cuts a circle too little of it is seen.
+    few, and do not look like what is around them; on dark soil no cap looks just like that. Even
+    ground, such as a table, holds no clods, and where the border cuts a circle too little of it is
+    seen.
 
     Args:
         color: (H, W, 3) RGB.
@@ -67,11 +69,12 @@ def without_clods(color: Bytes, circles: Circles, unseen: Bools) -> Circles:
     """
     corner = np.array([color.shape[1] - 1, color.shape[0] - 1])
     room = np.minimum(circles.center, corner - circles.center)
-    asked = unseen & (room.min(axis=1) >= circles.radius)
-    if not asked.any():
-        return circles
-    away = off_ground(color, circles, tones_of(color, circles), asked, _UNEVEN)
-    return circles.take(~(away < _GROUND))
+    whole, tones = room.min(axis=1) >= circles.radius, tones_of(color, circles)
+    dark = darker(tones, _SOIL * np.exp(_EXACTLY * UNIT[0]))  # as only clods on soil are
+    ground = ground_of(color, circles, whole & (unseen | dark))
+    away = off_ground(tones, ground)
+    clod = unseen & (away < _GROUND) & (ground[:, 3] >= _UNEVEN)
+    return circles.take(~(clod | ((away < _EXACTLY) & darker(ground, _SOIL))))
 
 
 def with_bare(
