@@ -15,9 +15,10 @@ from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE, Radii, certain_
 
 _AROUND = 4.0  # px; a circle of a network is not more exact than that
 _SAME = 0.5  # IoU from which on an outline is that of a circle
-_GROUND = 1.5  # distance of tones up to which an unseen circle looks like the ground around it
-_EXACTLY, _SOIL = 0.5, 100.0  # and any on ground darker than this gray level: of 2695 caps one did
-_UNEVEN = 0.12  # spread of its brightness over the mean, below which ground holds no clods
+_SOIL = 100.0  # gray level; brighter ground holds no clods
+_GROUND = 1.5  # distance of tones up to which an unseen circle looks like the soil around it
+_EXACTLY = 0.5  # and up to which any does; of 2695 caps of simulated frames on soil one did
+_UNEVEN = 0.12  # spread of the brightness of soil over its mean
 _OWN = 0.5  # share of a circle that none that was accepted may cover
 
 
@@ -55,12 +56,12 @@ def agreement(shapes: Floats, radius: Floats, learned: Circles) -> Floats:
 
 
 def without_clods(color: Bytes, circles: Circles, unseen: Bools) -> Circles:
-    """Return the circles but for those that look like the ground.
+    """Return the circles but for those that look like the dark soil they lie on.
 
-    A round clod has the form of a cap in depth as well. Caps that the network sees nothing of are
-    few, and do not look like what is around them; on dark soil no cap looks just like that. Even
-    ground, such as a table, holds no clods, and where the border cuts a circle too little of it is
-    seen.
+    A round clod has the form of a cap in depth as well, and looks just like the soil, as no cap
+    does. Caps that the network sees nothing of are few, and do not come near to it, unless it is
+    even. White caps on mycelium or a table do look like that, and where the border cuts a circle
+    too little of the ground is seen.
 
     Args:
         color: (H, W, 3) RGB.
@@ -70,11 +71,11 @@ def without_clods(color: Bytes, circles: Circles, unseen: Bools) -> Circles:
     corner = np.array([color.shape[1] - 1, color.shape[0] - 1])
     room = np.minimum(circles.center, corner - circles.center)
     whole, tones = room.min(axis=1) >= circles.radius, tones_of(color, circles)
-    dark = darker(tones, _SOIL * np.exp(_EXACTLY * UNIT[0]))  # as only clods on soil are
-    ground = ground_of(color, circles, whole & (unseen | dark))
+    dim = darker(tones, _SOIL * np.exp(_GROUND * UNIT[0]))  # as all are that come near to soil
+    ground = ground_of(color, circles, whole & dim)
     away = off_ground(tones, ground)
-    clod = unseen & (away < _GROUND) & (ground[:, 3] >= _UNEVEN)
-    return circles.take(~(clod | ((away < _EXACTLY) & darker(ground, _SOIL))))
+    clod = (away < _EXACTLY) | (unseen & (away < _GROUND) & (ground[:, 3] >= _UNEVEN))
+    return circles.take(~(clod & darker(ground, _SOIL)))
 
 
 def with_bare(
