@@ -10,7 +10,7 @@ from mushpipe import Circles
 from mushpipe.core.arrays import Bools, Bytes, Floats, Ints32, Singles
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.cap_clod import darker, ground_of, off_ground
-from mushpipe.stages.cap_kin import UNIT, tones_of
+from mushpipe.stages.cap_kin import tones_of
 from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE, Radii, certain_first, iou, lens
 
 _AROUND = 4.0  # px; a circle of a network is not more exact than that
@@ -71,8 +71,8 @@ def without_clods(color: Bytes, circles: Circles, unseen: Bools) -> Circles:
     corner = np.array([color.shape[1] - 1, color.shape[0] - 1])
     room = np.minimum(circles.center, corner - circles.center)
     whole, tones = room.min(axis=1) >= circles.radius, tones_of(color, circles)
-    dim = darker(tones, _SOIL * np.exp(_GROUND * UNIT[0]))  # as all are that come near to soil
-    ground = ground_of(color, circles, whole & dim)
+    # a tone that is within reach of that of soil is no brighter than this
+    ground = ground_of(color, circles, whole & darker(tones - _GROUND, _SOIL))
     away = off_ground(tones, ground)
     clod = (away < _EXACTLY) | (unseen & (away < _GROUND) & (ground[:, 3] >= _UNEVEN))
     return circles.take(~(clod & darker(ground, _SOIL)))
