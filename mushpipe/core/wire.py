@@ -143,8 +143,7 @@ def encode_depth(frame: RgbdFrame) -> Message:
         raise ValueError("the frame has no depth")
     if frame.depth.dtype == np.float32:
         encoding = "32FC1"
-    else:
-        # RealSense states its scale in single precision
+    else:  # RealSense states its scale in single precision
         millimetres = np.float32(frame.depth_scale) == np.float32(0.001)
         encoding = "16UC1" if millimetres else "mono16"
     data = encode_image(frame.depth, encoding, frame.header)

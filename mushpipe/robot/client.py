@@ -113,7 +113,11 @@ class RobotClient:
         """
         answer = self.ask("get_targets", **fields)
         found: list[Message] = answer.get("targets", [])
-        return found if self.late_ms < answer.get("valid_ms", math.inf) else []
+        return [] if self.too_late(answer) else found
+
+    def too_late(self, message: Message) -> bool:
+        """Return whether a message, the last one, was so long on the way that it is not valid."""
+        return bool(self.late_ms >= message.get("valid_ms", math.inf))
 
     def ack(self, target: str, result: str, **fields: Any) -> bool:
         """Tell what the robot does with a target; only True allows it to go on."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import sys
 import time
 from dataclasses import dataclass
@@ -149,7 +148,7 @@ def _converse(connection: RobotClient, talk: _Talk) -> None:
         else:
             message = connection.ask("get_targets", **talk.asked)
         _show(message, talk.raw)
-        if connection.late_ms > message.get("valid_ms", math.inf):
+        if connection.too_late(message):
             _note(f"{connection.late_ms:.0f} ms late on the way: no longer valid")
             message["targets"] = []
         talk.shown += message["op"] != "heartbeat"
