@@ -11,7 +11,7 @@ from mushpipe.core.arrays import Floats
 from mushpipe.sim.mushroom import Kind, Mushroom
 from mushpipe.sim.noise import generator
 from mushpipe.sim.settings import SceneSettings
-from mushpipe.sim.shapes import CapShape, Warp, deformed, draw_shape
+from mushpipe.sim.shapes import CapShape, Warp, aged, deformed, draw_shape
 
 _TINTS = {
     "white": (0.83, 0.80, 0.735),
@@ -190,7 +190,7 @@ def _grow(
         axis,
         float(rng.uniform(0, 2 * np.pi)),
         radius,
-        _shape(settings, kind, float(age), rng),
+        _shape(settings, kind, float(age), row, rng),
         foot,
         float(stem),
         (float(tint[0]), float(tint[1]), float(tint[2])),
@@ -208,10 +208,15 @@ def _lean(seed: int, row: int, radius: float) -> Floats:
     return np.array([np.cos(turn), np.sin(turn)]) * far
 
 
-def _shape(settings: SceneSettings, kind: Kind, age: float, rng: np.random.Generator) -> CapShape:
+def _shape(
+    settings: SceneSettings, kind: Kind, age: float, row: int, rng: np.random.Generator
+) -> CapShape:
     shape = draw_shape(rng, settings.shape_family, age)
     if settings.deform:
         shape = deformed(shape, settings.deform, rng)
+    if settings.old:
+        years = generator(settings.seed, "old", row)
+        shape = aged(shape, years) if years.random() < settings.old else shape
     if kind == Kind.PRINTED:  # one CAD model, a little different in print
         return CapShape(shape.family, shape.height, shape.form, shape.lip, shape.curl, True, Warp())
     return shape

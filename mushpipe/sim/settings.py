@@ -47,6 +47,9 @@ class SceneSettings(Group):
     deform: float = Field(
         0, ge=0, le=1, description="departure of caps from their family; 0: as the family has it"
     )
+    old: float = Field(
+        0, ge=0, le=1, description="share of old caps: open, low, their middle often sunk"
+    )
     printed: bool = Field(
         True, description="the lab's mushrooms are printed ones; else real ones, cut"
     )

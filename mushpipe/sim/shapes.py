@@ -25,12 +25,13 @@ class CapShape:
     Attributes:
         family: ``a``: the dome is a superellipse, rho^p + (z/h)^p = 1; ``b``: a cubic Bezier curve
             from (0, h) by (k1, h) and (1, k2 h) to (1, 0).
-        height: h, from the rim plane to the top.
+        height: h, from the rim plane to the middle of the top.
         form: (p,) of family a, (k1, k2) of family b.
         lip: How far the margin hangs below the rim plane.
         curl: How far it rolls inwards.
         veil: Whether the underside is still closed.
         warp: Departures from a surface of revolution.
+        sunk: How far a ring around the middle stands above it, or, if negative, below: a hump.
     """
 
     family: Family
@@ -40,6 +41,7 @@ class CapShape:
     curl: float
     veil: bool
     warp: Warp
+    sunk: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,16 @@ def deformed(shape: CapShape, amount: float, rng: np.random.Generator) -> CapSha
     )
 
 
+def aged(shape: CapShape, rng: np.random.Generator) -> CapShape:
+    """Return a cap as old ones are: open, low, its margin unrolled, its middle often sunk."""
+    height = rng.uniform(0.08, 0.34)
+    sunk = rng.uniform(-0.3 * height, 0.16) if rng.random() < 0.6 else 0.0
+    lip, curl = rng.uniform((0.02, 0.03), (0.12, 0.2))
+    return replace(
+        shape, height=float(height), lip=float(lip), curl=float(curl), veil=False, sunk=float(sunk)
+    )
+
+
 def draw_warp(rng: np.random.Generator, age: float) -> Warp:
     """Draw the asymmetry of a grown cap: rim 1.5 / 0.8 %, bumps 0.6 % x 4, shear 4 %."""
 
@@ -107,12 +119,14 @@ def dome(shape: CapShape, rings: int) -> tuple[Floats, Floats]:
     if shape.family == "a":
         power = 2 / shape.form[0]
         rho, z = np.sin(t * np.pi / 2) ** power, np.cos(t * np.pi / 2) ** power
+        ring = 4 * rho**2 * (1 - rho**2)
     else:
         k1, k2 = shape.form
         rho = 3 * t * (1 - t) ** 2 * k1 + 3 * t**2 * (1 - t) + t**3
         z = (1 - t) ** 3 + 3 * t * (1 - t) ** 2 + 3 * t**2 * (1 - t) * k2
+        ring = np.sin(np.pi * rho) ** 2
     z[-1], rho[-1], rho[0] = 0.0, 1.0, 0.0
-    return rho, shape.height * z
+    return rho, shape.height * z + shape.sunk * ring
 
 
 def margin(shape: CapShape, rings: int) -> tuple[Floats, Floats]:

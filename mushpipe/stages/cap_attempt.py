@@ -31,10 +31,11 @@ from mushpipe.stages.cap_samples import (
 from mushpipe.stages.cap_solve import (
     ROUND,
     STAGES,
+    Habit,
     Noise,
-    Upright,
     Work,
     refine,
+    variance_of_aspect,
     variance_of_tilt,
     workspace,
 )
@@ -46,11 +47,11 @@ ODD = 0.5  # misfit at which is looked whether depth denies the outline:
 DENIED = 4  # in so many of 32 directions, and the circle is put right;
 DENIAL = 0.05  # each counts as so much misfit,
 MENDED = 0.7  # and so much smaller the sum must be in another circle
-COUNTS = 8  # numbers that are kept of a fit:
+COUNTS = 9  # numbers that are kept of a fit:
 # how many points, edge rays and outline rays it has, and points of other depth; the sum of the
-# points' weights; the radius of the circle at the cap, m; misfit; and variance of the tilt, rad^2,
-# per direction. Without points there is no fit.
-POINTS, EDGES, LINES, OTHERS, WEIGHT, EXTENT, MISFIT, TILT = range(COUNTS)
+# points' weights; the radius of the circle at the cap, m; misfit; and variances of the tilt, rad^2,
+# per direction, and of the dome's height beside the usual one, m^2. Without points there is no fit.
+POINTS, EDGES, LINES, OTHERS, WEIGHT, EXTENT, MISFIT, TILT, RISE = range(COUNTS)
 
 
 class Frame(NamedTuple):
@@ -149,7 +150,7 @@ def gather(
 @borrower
 def attempt(
     frame: Frame, circle: Floats, rank: int, size: float, seen: tuple[Singles, int],
-    upright: Upright, settings: Settings, cap: Floats, room: Room,
+    habit: Habit, settings: Settings, cap: Floats, room: Room,
 ) -> tuple[int, float]:  # fmt: skip
     """Fit a cap from where it starts: to its depth, then to its outline in colour as well.
 
@@ -159,7 +160,7 @@ def attempt(
         rank: Of the circle.
         size: Its radius at the cap, m.
         seen: The cap's rays (6, ROOM), with room for those of the outline, and how many there are.
-        upright: How caps stand.
+        habit: How caps grow.
         settings: How.
         cap: (15,) parameters, in and out.
         room: From `scratch`; the last step's normal matrix, factored, stays in its workspace.
@@ -169,12 +170,12 @@ def attempt(
     """
     gray, image = frame
     (rays, count), setting, work = seen, (settings.noise, 1.0 / image.focal, size), room.work
-    if refine(cap, rays, count, upright, setting, STAGES[0], STAGES[1], work)[0] < 0.0:
+    if refine(cap, rays, count, habit, setting, STAGES[0], STAGES[1], work)[0] < 0.0:
         return 0, np.inf
     lines = sample_outline(
         gray, image, rank, cap, circle, settings.outline_px, room.lanes, rays[:, count:]
     )
-    total, misfit = refine(cap, rays, count + lines, upright, setting, STAGES[1], STAGES[2], work)
+    total, misfit = refine(cap, rays, count + lines, habit, setting, STAGES[1], STAGES[2], work)
     return (lines, misfit) if total >= 0.0 else (0, np.inf)
 
 
@@ -188,7 +189,7 @@ def take(rays: Singles, other: Singles, first: int, last: int) -> None:
 
 @borrower
 def fit_circle(
-    frame: Frame, circle: Floats, rank: int, upright: Upright, settings: Settings,
+    frame: Frame, circle: Floats, rank: int, habit: Habit, settings: Settings,
     fit: Fit, room: Room,
 ) -> float:  # fmt: skip
     """Fit the cap in a circle, from several starts if the first fit is poor; return the misfit.
@@ -197,7 +198,7 @@ def fit_circle(
         frame: What it is fitted to.
         circle: (3,) x, y, radius, px.
         rank: Of the circle.
-        upright: How caps stand.
+        habit: How caps grow.
         settings: How.
         fit: Out, but for weight and misfit, which `second_fit` adds. Without a fit the counts stay
             as they are and the misfit is infinite.
@@ -210,24 +211,25 @@ def fit_circle(
         return np.inf
     size, count, points = circle[2] * middle / image.focal, ROUND + n + m, rays[:, ROUND:]
     ray = ray_at(image, circle[0], circle[1])
-    start(cap, axis_of(points, n, upright.up, ray, USUAL[0]), USUAL, ray, middle, size)
-    lines, misfit = attempt(frame, circle, rank, size, (rays, count), upright, settings, cap, room)
-    variance = variance_of_tilt(normal)
+    start(cap, axis_of(points, n, habit.up, ray, USUAL[0]), USUAL, ray, middle, size)
+    lines, misfit = attempt(frame, circle, rank, size, (rays, count), habit, settings, cap, room)
+    tilt, rise = variance_of_tilt(normal), variance_of_aspect(normal, habit.aspect)
     if misfit > POOR:
         take(rival.rays, rays, 0, count)
-        leaning = axis_of(points, n, upright.up, ray, CONICAL[0])
-        for axis in (upright.up, (-ray[0], -ray[1], -ray[2]), leaning):
+        leaning = axis_of(points, n, habit.up, ray, CONICAL[0])
+        for axis in (habit.up, (-ray[0], -ray[1], -ray[2]), leaning):
             start(rival.cap, axis, CONICAL, ray, middle, size)
             found, rest = attempt(
-                frame, circle, rank, size, (rival.rays, count), upright, settings, rival.cap, room
+                frame, circle, rank, size, (rival.rays, count), habit, settings, rival.cap, room
             )
             if rest < BETTER * misfit:
-                lines, misfit, variance = found, rest, variance_of_tilt(normal)
+                lines, misfit, tilt = found, rest, variance_of_tilt(normal)
+                rise = variance_of_aspect(normal, habit.aspect)
                 take(rays, rival.rays, count, ROOM)
                 put(cap, rival.cap)
     if np.isfinite(misfit):
         counts[POINTS], counts[EDGES], counts[LINES], counts[OTHERS] = n, m, lines, other
-        counts[EXTENT], counts[TILT] = size, variance
+        counts[EXTENT], counts[TILT], counts[RISE] = size, tilt, rise
     return misfit
 
 
@@ -242,7 +244,7 @@ def denied_by(
 
 @borrower
 def fit_cap(
-    frame: Frame, circle: Floats, ranks: tuple[int, int], upright: Upright,
+    frame: Frame, circle: Floats, ranks: tuple[int, int], habit: Habit,
     settings: Settings, fit: Fit, room: Room,
 ) -> None:  # fmt: skip
     """Fit the cap in a circle; where depth denies it, in the circle that depth suggests, too.
@@ -254,12 +256,12 @@ def fit_cap(
         frame: What it is fitted to.
         circle: (3,) x, y, radius, px, as detected.
         ranks: Of the circle, and of no circle.
-        upright: How caps stand.
+        habit: How caps grow.
         settings: How.
         fit: Out, as by `fit_circle`; without a fit it keeps its count of 0.
         room: From `scratch`.
     """
-    misfit = fit_circle(frame, circle, ranks[0], upright, settings, fit, room)
+    misfit = fit_circle(frame, circle, ranks[0], habit, settings, fit, room)
     others = fit.counts[OTHERS]
     astray = others > ASTRAY * (fit.counts[POINTS] + others)
     if astray or not ODD < misfit < np.inf:
@@ -271,7 +273,7 @@ def fit_cap(
     middle = fit.cap[2] - 0.5 * fit.cap[HEIGHT] + bias
     if not regrow(frame.image, ranks, circle, middle, grown):
         return
-    rest = fit_circle(frame, grown, ranks[0], upright, settings, other, room)
+    rest = fit_circle(frame, grown, ranks[0], habit, settings, other, room)
     if not rest < 2.0 * POOR:
         return  # neither is believed
     still = denied_by(frame, grown, ranks, other.cap, bias, room)

@@ -17,6 +17,7 @@ from mushpipe.stages.cap_attempt import (
     OTHERS,
     POINTS,
     POOR,
+    RISE,
     TILT,
     WEIGHT,
     Fit,
@@ -28,6 +29,8 @@ from mushpipe.stages.cap_attempt import (
 )
 from mushpipe.stages.cap_blocks import CELLS
 from mushpipe.stages.cap_circle import improve
+from mushpipe.stages.cap_habit import spread_of, usual_aspect
+from mushpipe.stages.cap_linear import invert
 from mushpipe.stages.cap_model import (
     HEIGHT,
     RADIUS,
@@ -43,8 +46,7 @@ from mushpipe.stages.cap_model import (
     slope,
 )
 from mushpipe.stages.cap_samples import ASTRAY, DIRECTIONS, ray_at
-from mushpipe.stages.cap_solve import ROUND, STAGES, Upright, invert, refine, tilt
-from mushpipe.stages.cap_start import spread_of
+from mushpipe.stages.cap_solve import ROUND, STAGES, Habit, refine, tilt
 
 ROUNDNESS = 0.01  # in rim radii: how far the rim of a cap is from the circle of its area
 GUESSED = 0.1  # in rim radii: how far off an outline is that no depth edge confirms,
@@ -100,7 +102,7 @@ class Fits:
 
 @borrower
 def second_fit(
-    frame: Frame, circle: Floats, upright: Upright, settings: Settings, fit: Fit,
+    frame: Frame, circle: Floats, habit: Habit, settings: Settings, fit: Fit,
     covariance: Floats, told: Floats, room: Room,
 ) -> None:  # fmt: skip
     """Refine a fit with what the scene says of its cap's tilt, and then its circle, in place.
@@ -112,7 +114,7 @@ def second_fit(
     count = ROUND + int(counts[POINTS] + counts[EDGES] + counts[LINES])
     setting = (noise, 1.0 / image.focal, counts[EXTENT])
     counts[WEIGHT], counts[MISFIT] = refine(
-        cap, rays, count, upright, setting, STAGES[2], STAGES[3], room.work
+        cap, rays, count, habit, setting, STAGES[2], STAGES[3], room.work
     )
     invert(room.work[0][0], covariance)
     held, doubt = (counts[EDGES], counts[LINES]), max(1.0, counts[MISFIT] / POOR)
@@ -131,7 +133,7 @@ def second_fit(
 
 @jit
 def fit_all(
-    frame: Frame, circles: Floats, rank: Ints, upright: Upright,
+    frame: Frame, circles: Floats, rank: Ints, habit: Habit,
     settings: Settings, out: tuple[Floats, ...],
 ) -> None:  # fmt: skip
     """Fit every cap, first with the same prior for all, then with what they say of the scene.
@@ -140,7 +142,7 @@ def fit_all(
         frame: What they are fitted to.
         circles: (N, 3) x, y, radius, px.
         rank: (N,) of them, as `ranks` from `by_depth`.
-        upright: How caps stand.
+        habit: How caps grow.
         settings: How.
         out: Per cap its circle, improved; parameters, covariance, what follows, and counts, as by
             `second_fit`. A cap without a fit keeps its circle and has a count of 0, the rest NaN.
@@ -149,18 +151,22 @@ def fit_all(
     room, n = scratch(*frame.image.depth.shape), len(circles)
     rays = np.empty((n, 6, ROOM), np.float32)
     squares, variances, spreads = np.full(n, -1.0), np.ones(n), np.empty(n)
+    aspects, rises = np.full(n, -1.0), np.ones(n)
     for i in range(n):
         fit = Fit(rays[i], caps[i], counts[i])
-        fit_cap(frame, circles[i], (rank[i], n), upright, settings, fit, room)
+        fit_cap(frame, circles[i], (rank[i], n), habit, settings, fit, room)
         if counts[i, POINTS] > 0:
-            first, second = tilt(caps[i], upright.up)
+            first, second = tilt(caps[i], habit.up)
             squares[i] = first * first + second * second
             variances[i] = counts[i, TILT]
-    spread_of(squares, variances, upright.spread, spreads)
+            aspects[i] = caps[i, HEIGHT] / caps[i, RADIUS]
+            rises[i] = counts[i, RISE] / caps[i, RADIUS] ** 2
+    spread_of(squares, variances, habit.spread, spreads)
+    aspect = usual_aspect(aspects, rises, habit.aspect, settings.noise.aspect_sigma)
     for i in range(n):
         if counts[i, POINTS] > 0:
             improved[i] = circles[i]
-            fit, own = Fit(rays[i], caps[i], counts[i]), Upright(upright.up, spreads[i])
+            fit, own = Fit(rays[i], caps[i], counts[i]), Habit(habit.up, spreads[i], aspect)
             second_fit(frame, improved[i], own, settings, fit, covariances[i], told[i], room)
         if not counts[i, POINTS] > 0:
             improved[i] = circles[i]
@@ -227,7 +233,7 @@ def fit_caps(
     frame: Frame,
     circles: Floats,
     rank: Ints,
-    upright: Upright,
+    habit: Habit,
     settings: Settings,
 ) -> Fits:
     """Fit a cap to the depth in each circle.
@@ -236,7 +242,7 @@ def fit_caps(
         frame: What they are fitted to.
         circles: (N, 3) x, y, radius, px.
         rank: (N,) of them, as `ranks` from `by_depth`.
-        upright: How caps stand.
+        habit: How caps grow.
         settings: How.
     """
     n = len(circles)
@@ -247,8 +253,8 @@ def fit_caps(
         np.empty((n, TOLD)),
         np.zeros((n, COUNTS)),
     )
-    fit_all(frame, circles, rank, upright, settings, out)
-    return _fits(*out, np.array(upright.up))
+    fit_all(frame, circles, rank, habit, settings, out)
+    return _fits(*out, np.array(habit.up))
 
 
 def _fits(

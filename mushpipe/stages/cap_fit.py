@@ -27,7 +27,7 @@ from mushpipe.stages.cap_gap import EdgeWatch
 from mushpipe.stages.cap_kin import FEWEST, kin_of, unlike
 from mushpipe.stages.cap_model import ASPECT, ASPECT_SIGMA
 from mushpipe.stages.cap_order import Order, by_depth
-from mushpipe.stages.cap_solve import Noise, Upright
+from mushpipe.stages.cap_solve import Habit, Noise
 from mushpipe.stages.cap_verify import chances
 from mushpipe.stages.discs import discs_of
 from mushpipe.stages.surface_fit import fit_tops, sources, variance_along, without_tip
@@ -156,7 +156,6 @@ class CapFit(Stage):
             shape=0.027,
             outline=0.03,
             circle_px=self.circle_sigma_px,
-            aspect=ASPECT,
             aspect_sigma=ASPECT_SIGMA,
             bulge=0.0,
             bulge_sigma=0.08,
@@ -175,7 +174,7 @@ class CapFit(Stage):
             Frame(gray, Image(depth, rays, ranks, camera.focal)),
             discs,
             rank,
-            Upright((x, y, z), float(np.radians(self.tilt_deg))),
+            Habit((x, y, z), float(np.radians(self.tilt_deg)), ASPECT),
             Settings(noise, sensor, self.outline_sigma_px, self.min_points),
         )
 

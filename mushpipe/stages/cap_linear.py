@@ -95,6 +95,18 @@ def invert_factor(factor: Floats, first: int, last: int) -> None:
             factor[i, j] = value * factor[i, i]
 
 
+@borrower
+def invert(factor: Floats, out: Floats) -> None:
+    """Fill the inverse (8, 8) of a matrix that `cholesky` has factored; the factor is lost."""
+    invert_factor(factor, 0, UNKNOWNS - 1)
+    for i in range(UNKNOWNS):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(i, UNKNOWNS):
+                total += factor[k, i] * factor[k, j]
+            out[i, j] = out[j, i] = total
+
+
 @inlined
 def solve3(matrix: Six, right: Vector) -> tuple[bool, Vector]:
     """Return whether a symmetric system of three equations has a solution, and it (Cramer's rule).

@@ -49,8 +49,7 @@ class Noise(NamedTuple):
         shape: In rim radii, how far a cap's surface departs from the model.
         outline: In rim radii, how far its outline does.
         circle_px: Of the detected circle's centre and radius, px.
-        aspect: Middle aspect h/R of a cap.
-        aspect_sigma: Its spread.
+        aspect_sigma: Spread of the aspect h/R of caps.
         bulge: Middle bulge of a cap's profile.
         bulge_sigma: Its spread.
         firm: How many independent rays the stated sigmas are worth, against a cap's residuals.
@@ -60,7 +59,6 @@ class Noise(NamedTuple):
     shape: float
     outline: float
     circle_px: float
-    aspect: float
     aspect_sigma: float
     bulge: float
     bulge_sigma: float
@@ -68,11 +66,18 @@ class Noise(NamedTuple):
     usual: float
 
 
-class Upright(NamedTuple):
-    """How caps stand: the unit vector up, and the spread of tilts off it per direction, rad."""
+class Habit(NamedTuple):
+    """How caps grow.
+
+    Attributes:
+        up: Unit vector.
+        spread: Of tilts off it per direction, rad.
+        aspect: Height of a usual dome, in rim radii.
+    """
 
     up: Vector
     spread: float
+    aspect: float
 
 
 System = tuple[Floats, Floats]  # normal matrix (8, 8) and gradient (8,)
@@ -158,20 +163,20 @@ def tilt(cap: Floats, up: Vector) -> tuple[float, float]:
 
 
 @borrower
-def add_priors(cap: Floats, upright: Upright, noise: Noise, system: System) -> None:
+def add_priors(cap: Floats, habit: Habit, noise: Noise, system: System) -> None:
     """Add what is known of any cap: aspect, bulge, and that it grows upwards, more or less."""
     normal, gradient = system
     weight = 1.0 / (noise.aspect_sigma * cap[RADIUS]) ** 2
-    off = weight * (cap[HEIGHT] - noise.aspect * cap[RADIUS])
-    normal[5, 5] += noise.aspect**2 * weight
-    normal[6, 5] -= noise.aspect * weight
+    off = weight * (cap[HEIGHT] - habit.aspect * cap[RADIUS])
+    normal[5, 5] += habit.aspect**2 * weight
+    normal[6, 5] -= habit.aspect * weight
     normal[6, 6] += weight
-    gradient[5] -= noise.aspect * off
+    gradient[5] -= habit.aspect * off
     gradient[6] += off
-    lean = tilt(cap, upright.up)
+    lean = tilt(cap, habit.up)
     for w in range(2):
-        normal[3 + w, 3 + w] += 1.0 / upright.spread**2
-        gradient[3 + w] += lean[w] / upright.spread**2
+        normal[3 + w, 3 + w] += 1.0 / habit.spread**2
+        gradient[3 + w] += lean[w] / habit.spread**2
     normal[7, 7] += 1.0 / noise.bulge_sigma**2
     gradient[7] += (cap[BULGE] - noise.bulge) / noise.bulge_sigma**2
 
@@ -217,7 +222,7 @@ def refine(
     cap: Floats,
     rays: Singles,
     count: int,
-    upright: Upright,
+    habit: Habit,
     settings: tuple[Noise, float, float],
     first: int,
     last: int,
@@ -229,7 +234,7 @@ def refine(
         cap: (15,) the estimate, in and out.
         rays: (6, M) as in `weigh`; the first ROUND lie around the detected circle.
         count: How many columns are rays.
-        upright: How caps stand.
+        habit: How caps stand.
         settings: `Noise`, the angle of a pixel (rad), and the size of the circle at the cap (m).
         first: Number of the first step.
         last: Past the last.
@@ -249,7 +254,7 @@ def refine(
         variance = (noise.circle_px * pixel * cap[2]) ** 2 + (noise.outline * cap[RADIUS]) ** 2
         weigh_circle(rows, variance, TOUCH_CUTS[min(step, STEPS - 1)], weights)
         multiply(flat, weights, padded, system)
-        add_priors(cap, upright, noise, system)
+        add_priors(cap, habit, noise, system)
         if not cholesky(normal):
             return -1.0, misfit
         substitute(normal, gradient)
@@ -276,12 +281,12 @@ def variance_of_tilt(factor: Floats) -> float:
 
 
 @borrower
-def invert(factor: Floats, out: Floats) -> None:
-    """Fill the inverse (8, 8) of a matrix that `cholesky` has factored; the factor is lost."""
-    invert_factor(factor, 0, UNKNOWNS - 1)
-    for i in range(UNKNOWNS):
-        for j in range(i + 1):
-            total = 0.0
-            for k in range(i, UNKNOWNS):
-                total += factor[k, i] * factor[k, j]
-            out[i, j] = out[j, i] = total
+def variance_of_aspect(factor: Floats, aspect: float) -> float:
+    """Return the variance of h - aspect R, m^2, from a matrix `cholesky` factored.
+
+    The diagonal of the factor holds reciprocals.
+    """
+    fifth = -aspect * factor[5, 5]
+    sixth = (1.0 - factor[6, 5] * fifth) * factor[6, 6]
+    seventh = (factor[7, 5] * fifth + factor[7, 6] * sixth) * factor[7, 7]
+    return float(fifth * fifth + sixth * sixth + seventh * seventh)

@@ -1,20 +1,17 @@
-"""Where a fit starts, and how far the caps of a scene lean: what the single fit cannot know."""
+"""Where the fit of a cap starts: at the plane through its points."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from mushpipe.core.arrays import Floats, Singles
-from mushpipe.core.jit import borrower, jit
+from mushpipe.core.jit import borrower
 from mushpipe.stages.cap_linear import solve3
 from mushpipe.stages.cap_model import ASPECT, BULGE, HEIGHT, RADIUS, N, Vector, span
 
 USUAL, CONICAL = (ASPECT, 0.0), (0.85, -0.1)  # aspect and bulge that a fit may start with
 RIM = 0.73  # depth of the rim plane below the middle of the visible part, in heights of the dome
 STEEPEST = 0.9  # rad off the line of sight at which a fit may start
-DEGREES = 4.0  # of freedom of Student's t: how readily a leaning cap is let go
-PRIOR_CAPS = 0.1  # the spread that is set counts as much as so many caps
-NARROWEST = np.radians(2.0)
 
 
 @borrower
@@ -85,38 +82,3 @@ def start(
     cap[HEIGHT] = form[0] * cap[RADIUS]
     cap[BULGE] = form[1]
     span(cap)
-
-
-@jit
-def spread_of(squares: Floats, variances: Floats, spread: float, out: Floats) -> None:
-    """Estimate how far the caps of a scene lean, and what that says of each of them.
-
-    Expectation maximisation for Student's t around the upright: a scene of upright caps holds its
-    caps tight, one of leaning caps does not, and a cap that clearly leans is let go in either.
-
-    Args:
-        squares: (N,) squared tilt of each fit, rad^2; negative where there is none.
-        variances: (N,) its variance per direction, the prior's share included.
-        spread: The spread per direction (rad) those fits were made with.
-        out: (N,) out: the spread to fit each cap with, rad.
-    """
-    count, square, before = len(squares), spread**2, spread**2
-    data, mean, seen = np.zeros(count), np.zeros(count), np.zeros(count)
-    for i in range(count):
-        if squares[i] >= 0.0:
-            data[i] = max(1.0 / variances[i] - 1.0 / spread**2, 1e-6)
-            mean[i] = squares[i] * (1.0 / variances[i] / data[i]) ** 2
-            seen[i] = 1.0
-    for _ in range(15):
-        total, number, per_square = PRIOR_CAPS * spread**2, PRIOR_CAPS, 1.0 / square
-        for i in range(count):
-            variance = 1.0 / (data[i] + per_square)
-            share = data[i] * variance
-            expected = mean[i] * share * share + 2.0 * variance
-            loose = (DEGREES + 2.0) / (DEGREES + expected * per_square)
-            out[i] = loose
-            total += seen[i] * 0.5 * loose * expected
-            number += seen[i]
-        before, square = square, max(total / number, NARROWEST**2)
-    for i in range(count):
-        out[i] = np.sqrt(before / out[i]) if seen[i] > 0.0 else np.sqrt(before)

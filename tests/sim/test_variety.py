@@ -13,7 +13,7 @@ from mushpipe.sim.mesh import Material
 from mushpipe.sim.mushroom import Kind
 from mushpipe.sim.planting import Area
 from mushpipe.sim.settings import SceneSettings
-from mushpipe.sim.shapes import deformed, draw_shape
+from mushpipe.sim.shapes import Family, aged, deformed, dome, draw_shape
 from mushpipe.sim.world import World, make_world
 
 AREA = Area(-0.1, 0.1, -0.08, 0.08)
@@ -97,6 +97,30 @@ def test_a_deformed_cap_keeps_its_family_and_its_rim_plane() -> None:
         assert other.family == shape.family
         assert 0.25 <= other.height <= 1.2
         assert replace(other, height=shape.height, form=shape.form, warp=shape.warp) == shape
+
+
+def test_old_caps_are_low_and_some_sunk_in_the_middle_and_others_stay_as_they_are() -> None:
+    plain, mixed, old = world(), world(old=0.5), world(old=1.0)
+    rows = [k for k, m in enumerate(plain.mushrooms) if m.kind == Kind.GROWING]
+    assert all(0.08 <= old.mushrooms[k].shape.height <= 0.34 for k in rows)
+    same = [plain.mushrooms[k].shape == mixed.mushrooms[k].shape for k in rows]
+    assert 0 < sum(same) < len(rows)
+    for a, b in zip(plain.mushrooms, old.mushrooms, strict=True):
+        assert np.array_equal(a.center, b.center)
+        assert np.array_equal(a.axis, b.axis)
+
+
+@pytest.mark.parametrize("family", ["a", "b"])
+def test_an_old_cap_keeps_its_rim_and_the_height_of_its_middle(family: Family) -> None:
+    rng = np.random.default_rng(6)
+    for _ in range(50):
+        shape = aged(draw_shape(rng, family, 0.8), rng)
+        rho, z = dome(shape, 300)
+        assert (rho[0], z[0]) == (0, pytest.approx(shape.height))
+        assert (rho[-1], z[-1]) == (1, pytest.approx(0, abs=1e-12))
+        assert z.min() > -1e-9
+        level = dome(replace(shape, sunk=0.0), 300)[1]
+        assert np.abs(z - level).max() == pytest.approx(abs(shape.sunk), rel=1e-3)
 
 
 def test_real_mushrooms_lie_on_a_table_where_asked_for() -> None:
