@@ -84,9 +84,10 @@ def samples(cases: Iterable[Case], stumps: bool = False) -> tuple[Floats, Floats
             for circles, deep in detected(frame):
                 fits = stage.fit(frame.gray, frame.depth_m, frame.camera, circles) if deep else None
                 use = np.isfinite(label := labels(circles, case.truth, stumps))
+                other = unlike(kin_of(frame.color, circles))
                 if fits is not None:
-                    use &= fits.valid & ~flat(fits)
-                rows.append(features(circles, unlike(kin_of(frame.color, circles)), fits)[use])
+                    use &= fits.valid & ~flat(fits, circles.score, other)
+                rows.append(features(circles, other, fits)[use])
                 right.append(label[use])
     return np.concatenate(rows), np.concatenate(right)
 

@@ -19,10 +19,12 @@ from mushpipe.stages.verifier import package_file, probability, read_models
 
 FILE = "fitted.yaml"
 ROUND = 0.6  # height over radius; a rounder cap is no more, and no less, likely one
-# Flatter than any cap in the training scenes: lids, cups upside down, paper and cut stumps. It is a
-# rule because a regression over standardised features gives rare ones little weight.
-FLAT = 0.15  # height over radius
-FLAT_CHANCE = 0.01  # of 127 that flat in the training scenes none was a cap
+# So flat are lids, cups upside down, paper and cut stumps. Old caps are, too, but look like others,
+# and the detector is sure of them. It is a rule because a regression over standardised features
+# gives rare ones little weight.
+FLAT = 0.15  # height over radius,
+ALIKE, PLAIN = 1.0, 0.8  # unless it is less unlike the sure caps, and has a higher score
+FLAT_CHANCE = 0.01
 FIT = ("misfit", "tilt", "aspect", "moved", "resized", "lean")
 NAMES = ("score", *FIT, "unlike")
 # What is known decides which model is asked; each is over some of these features.
@@ -64,9 +66,16 @@ def _of_fits(circles: Circles, fits: Fits) -> Floats:
     )
 
 
-def flat(fits: Fits) -> Bools:
-    """Return which fits (N,) are flatter than a cap; False where nothing was fitted."""
-    return np.asarray(fits.valid & (fits.height < FLAT * fits.radius))
+def flat(fits: Fits, score: Floats, unlike: Floats) -> Bools:
+    """Return which fits (N,) are as flat as hardly a cap, and not plainly a cap all the same.
+
+    Args:
+        fits: False where nothing was fitted.
+        score: (N,) of `phase-hough`.
+        unlike: (N,) as in `chances`.
+    """
+    low = fits.valid & (fits.height < FLAT * fits.radius)
+    return np.asarray(low & ~((unlike < ALIKE) & (score > PLAIN)))
 
 
 def chances(circles: Circles, unlike: Floats, fits: Fits | None = None) -> Floats:
@@ -75,7 +84,7 @@ def chances(circles: Circles, unlike: Floats, fits: Fits | None = None) -> Float
     It is what the fit tells, or the score where nothing was fitted; less where the circle looks
     unlike the sure caps. That it looks like them is no reason to believe in it: stems do, too.
     Where few are sure, other things than caps are more of what is seen, and a model of its own
-    decides. What was fitted as flat has `FLAT_CHANCE` at most.
+    decides. What was fitted as flat, and is not plainly a cap, has `FLAT_CHANCE` at most.
 
     Args:
         circles: As detected, with the scores of `phase-hough`.
@@ -88,7 +97,9 @@ def chances(circles: Circles, unlike: Floats, fits: Fits | None = None) -> Float
     if fits is not None:
         fitted = np.where(np.isfinite(unlike), model["fitted"], model["fitted_few"])
         chance = np.where(fits.valid, fitted, chance)
-        chance = np.where(flat(fits), np.minimum(chance, FLAT_CHANCE), chance)
+        chance = np.where(
+            flat(fits, circles.score, unlike), np.minimum(chance, FLAT_CHANCE), chance
+        )
         beside = np.where(fits.valid, model["fitted_kin"], beside)
     return np.where(np.isfinite(unlike), np.minimum(chance, beside), chance)
 
