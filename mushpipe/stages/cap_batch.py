@@ -27,7 +27,7 @@ from mushpipe.stages.cap_attempt import (
     fit_cap,
     scratch,
 )
-from mushpipe.stages.cap_blocks import CELLS
+from mushpipe.stages.cap_blocks import CELLS, Image
 from mushpipe.stages.cap_circle import improve
 from mushpipe.stages.cap_habit import spread_of, usual_aspect
 from mushpipe.stages.cap_linear import invert
@@ -45,12 +45,13 @@ from mushpipe.stages.cap_model import (
     meet,
     slope,
 )
-from mushpipe.stages.cap_samples import ASTRAY, DIRECTIONS, ray_at
+from mushpipe.stages.cap_samples import ASTRAY, COMPASS, DIRECTIONS, ray_at
 from mushpipe.stages.cap_solve import ROUND, STAGES, Habit, refine, tilt
 
 ROUNDNESS = 0.01  # in rim radii: how far the rim of a cap is from the circle of its area
 GUESSED = 0.1  # in rim radii: how far off an outline is that no depth edge confirms,
-SEEN = 5  # and with what power of the share that is not confirmed that grows
+SEEN = 5  # and with what power of the share that is not confirmed that grows;
+CUT = 0.4  # and the border of the image cuts off, by the square of its share
 TOLD = 11  # numbers that follow from a fit: surface point, m, and
 # where these begin: its sigmas, m; sigma of the tilt, rad, and of the radius, m; the apex, m
 SIGMAS, SIGMA_TILT, SIGMA_RADIUS, APEX = 3, 6, 7, 8
@@ -121,7 +122,7 @@ def second_fit(
     improve(circle, cap, held, doubt, image, room.lanes)
     ray = ray_at(image, circle[0], circle[1])
     locate(cap, ray, covariance, noise.circle_px / image.focal, told)
-    describe(fit, covariance, told)
+    describe(fit, covariance, beyond(circle, image), told)
     total = counts[WEIGHT] + counts[MISFIT]
     for value in cap:
         total += value
@@ -174,6 +175,18 @@ def fit_all(
 
 
 @borrower
+def beyond(circle: Floats, image: Image) -> float:
+    """Return the share of a circle (3,) that lies beyond the image."""
+    height, width = image.depth.shape
+    outside = 0
+    for j in range(DIRECTIONS):
+        x = circle[0] + circle[2] * COMPASS[j, 0]
+        y = circle[1] + circle[2] * COMPASS[j, 1]
+        outside += not (-0.5 <= x < width - 0.5 and -0.5 <= y < height - 0.5)
+    return outside / DIRECTIONS
+
+
+@borrower
 def locate(cap: Floats, ray: Vector, covariance: Floats, sigma: float, out: Floats) -> None:
     """Fill the point (3,) where a ray meets a cap, and its sigmas (3,), m.
 
@@ -207,17 +220,18 @@ def locate(cap: Floats, ray: Vector, covariance: Floats, sigma: float, out: Floa
 
 
 @borrower
-def describe(fit: Fit, covariance: Floats, told: Floats) -> None:
+def describe(fit: Fit, covariance: Floats, cut: float, told: Floats) -> None:
     """Widen the sigmas by what a fit cannot know of itself, and fill those of tilt and radius.
 
     Args:
         fit: Of the cap.
         covariance: (8, 8) of it.
+        cut: Share of its circle that lies beyond the image.
         told: (TOLD,) surface point and its sigmas, in and out; the rest, out.
     """
     _, cap, counts = fit
     doubt = max(1.0, counts[MISFIT] / POOR)
-    guessed = GUESSED * (1.0 - counts[EDGES] / DIRECTIONS) ** SEEN
+    guessed = GUESSED * (1.0 - counts[EDGES] / DIRECTIONS) ** SEEN + CUT * cut**2
     if counts[OTHERS] > ASTRAY * (counts[POINTS] + counts[OTHERS]):
         for i in range(SIGMAS, SIGMAS + 3):
             told[i] = np.hypot(told[i], cap[RADIUS])

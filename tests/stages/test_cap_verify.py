@@ -66,6 +66,26 @@ def test_a_lid_is_no_cap_however_sure_the_detector_is_and_a_flat_cap_is_one() ->
     assert (found.score[:2] > 0.9).all()
 
 
+@pytest.mark.parametrize(
+    ("score", "brightness", "stays"), [(0.95, 0.8, True), (0.75, 0.8, False), (0.95, 0.3, False)]
+)
+def test_an_old_flat_cap_stays_where_it_looks_like_the_others_and_is_plain(
+    score: float, brightness: float, stays: bool
+) -> None:
+    places = [(x, y, 0.4) for y in (-0.035, 0.035) for x in (-0.09, -0.03, 0.03, 0.09)]
+    caps = [cap(10, 40 * k, place, 0.017, 0.6) for k, place in enumerate(places[:7])]
+    old = cap(5, 90, places[7], 0.02, 0.1)
+    depth, gray = draw([*caps, old], BED)
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    circles = circles_of([*caps, old])
+    inside = np.hypot(u - circles.center[7, 0], v - circles.center[7, 1]) < circles.radius[7]
+    gray[inside] = brightness
+    depth += np.random.default_rng(1).normal(0, 0.0008, depth.shape)
+    circles = Circles(circles.center, circles.radius, [*np.full(7, 0.95), score])
+    _, _, found = CapFit(up="camera", min_score=0.5).process(frame_from(depth, gray), circles)
+    assert len(found) == 7 + stays
+
+
 def test_without_a_least_score_nothing_is_left_out_and_scores_stay() -> None:
     depth, gray, circles = scene()
     locations, poses, found = CapFit(up="camera").process(frame_from(depth, gray), circles)
