@@ -23,7 +23,7 @@ ROUND = 0.6  # height over radius; a rounder cap is no more, and no less, likely
 # and the detector is sure of them. It is a rule because a regression over standardised features
 # gives rare ones little weight.
 FLAT = 0.15  # height over radius,
-ALIKE, PLAIN = 1.0, 0.8  # unless it is less unlike the sure caps, and has a higher score
+ALIKE, PLAIN = 1.0, 0.6  # unless it is less unlike the sure caps, and has a higher score
 FLAT_CHANCE = 0.01
 FIT = ("misfit", "tilt", "aspect", "moved", "resized", "lean")
 NAMES = ("score", *FIT, "unlike")

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from mushpipe import Camera, Circles, DepthSource, Header, InputError, RgbdFrame
+from mushpipe.stages.cap_batch import beyond
 from mushpipe.stages.cap_fit import CapFit
 from tests.stages.caps import (
     CAMERA,
@@ -14,6 +17,7 @@ from tests.stages.caps import (
     circles_of,
     draw,
     frame_from,
+    image_of,
 )
 from tests.stages.test_cap_fit import fit
 
@@ -104,6 +108,30 @@ def test_a_cap_that_does_not_fit_the_model_says_so_in_its_sigmas() -> None:
     assert lumps.sigma_rad[0] > 1.3 * poses.sigma_rad[0]
     assert others.sigma_diameter[0] > 1.2 * locations.sigma_diameter[0]
     assert angle(lumps.axis[0], true.axis) < 3 * np.degrees(lumps.sigma_rad[0])
+
+
+def test_the_more_the_border_cuts_off_the_less_is_known() -> None:
+    sigmas, tilts = [], []
+    for x in (0.09, 0.145, 0.165):  # whole, a third cut off, more than half
+        true = cap(0, 0, (x, 0, 0.4), 0.03, 0.55)
+        locations, poses = fit([true])
+        assert abs(locations.diameter[0] - 0.06) < 2 * locations.sigma_diameter[0]
+        sigmas.append(locations.sigma_diameter[0])
+        tilts.append(poses.sigma_rad[0])
+    assert sigmas[2] > 1.5 * sigmas[1] > 2 * sigmas[0]
+    assert tilts[2] > 1.5 * tilts[1] > 2 * tilts[0]
+
+
+@given(st.floats(0, 400), st.floats(0, 300), st.floats(5, 60))
+def test_the_share_of_a_circle_beyond_the_image_is_that_of_its_arc(
+    x: float, y: float, radius: float
+) -> None:
+    image = image_of(np.full((CAMERA.height, CAMERA.width), 0.4))
+    turn = np.linspace(0, 2 * np.pi, 7200, endpoint=False)
+    u, v = x + radius * np.cos(turn), y + radius * np.sin(turn)
+    out = (u < -0.5) | (v < -0.5) | (u > CAMERA.width - 0.5) | (v > CAMERA.height - 0.5)
+    # of 32 directions; at each end of an arc one may be in or out
+    assert beyond(np.array([x, y, radius]), image) == pytest.approx(out.mean(), abs=4 / 32)
 
 
 def test_an_upright_without_direction_is_refused() -> None:
