@@ -57,6 +57,14 @@ CONDITIONS: dict[str, dict[str, Any]] = {
         "lids": 4,
         "relief_mm": 2,
     },
+    "cut": {
+        "stumps": 14,
+        "fresh": 0.8,
+        "count": 35,
+        "tilt_deg": (0, 25),
+        "lean": 0.5,
+        "mycelium": 0.8,
+    },
     "late": {
         "old": 0.8,
         "cap_color": "mixed",
@@ -75,20 +83,21 @@ TRAINING = {
     "even": 8, "gradient": 5, "dense": 8, "brown": 6, "tilted": 8, "mixed": 4, "cream": 2,
     "side": 3, "spot": 2, "harsh": 4, "near": 4, "far": 3, "oblique": 4, "lab": 4, "cloth": 2,
     "paint": 2, "empty": 3, "bare": 3, "fallen": 6, "wood": 6,
-    "low": 8, "lids": 6, "old": 10,
+    "low": 8, "lids": 6, "old": 10, "cut": 10,
 }  # fmt: skip
 # How many more of them, for what can learn from rare scenes without forgetting the usual ones.
 MORE = {"near": 2, "lab": 4, "cloth": 2, "paint": 2, "bare": 7, "wood": 2, "lids": 2}
 # How many frames with few caps, of which other things are as many, seeds from `FEW_SEED` on.
 FEW = {"bare": 24, "lab": 8, "cloth": 6, "paint": 6, "wood": 8, "few": 16, "picked": 20,
-       "late": 10}  # fmt: skip
+       "late": 10, "cut": 8}  # fmt: skip
 CHOOSING = {
     "even": 3, "gradient": 3, "dense": 3, "brown": 3, "tilted": 4, "harsh": 2, "near": 1,
     "oblique": 1, "lab": 2, "empty": 1, "bare": 1, "fallen": 2, "wood": 2,
-    "low": 3, "lids": 2, "old": 4,
+    "low": 3, "lids": 2, "old": 4, "cut": 4,
 }  # fmt: skip
 JUDGED = ("even", "gradient", "dense", "brown", "tilted", "side", "harsh", "lab", "empty", "bare",
-          "fallen", "wood", "low", "lids", "old")  # fmt: skip
+          "fallen", "wood", "low", "lids", "old",
+          "cut")  # fmt: skip
 CHOOSING_SEED, FEW_SEED, JUDGING_SEED = 900, 2000, 5000
 
 

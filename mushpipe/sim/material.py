@@ -189,7 +189,10 @@ class Painter:
         tone = 1 + 0.08 * self._at(surface, rows, 0.0012) + 0.06 * self._at(surface, rows, 0.005)
         color = (np.array([0.66, 0.56, 0.42]) * tone[:, None]).astype(np.float32)
         color = mix(color, (0.36, 0.25, 0.15), 0.7 * smoothstep(0.42, 0.2, share))
-        return mix(color, (0.78, 0.72, 0.60), 0.6 * smoothstep(0.86, 0.95, share))
+        color = mix(color, (0.78, 0.72, 0.60), 0.6 * smoothstep(0.86, 0.95, share))
+        fresh = np.array([m.fresh for m in self._world.mushrooms])[owner]
+        white = (np.array([0.77, 0.725, 0.625]) * (0.9 + 0.1 * tone[:, None])).astype(np.float32)
+        return np.where(fresh[:, None], white, color)
 
     def _clod(self, surface: Surface, rows: Ints) -> Singles:
         base = self._ground(surface, rows).mean(axis=1, keepdims=True)

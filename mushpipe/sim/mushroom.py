@@ -40,6 +40,7 @@ class Mushroom:
         dirt: 0..1, crumbs of soil on the cap.
         gloss: 0..1, how wet the skin is.
         grain: 0..1, contrast of growth rings, of wood.
+        fresh: Whether a stump was cut just now: flat, and as white at its cut as beside it.
     """
 
     kind: Kind
@@ -55,6 +56,7 @@ class Mushroom:
     dirt: float = 0.3
     gloss: float = 0.1
     grain: float = 0.0
+    fresh: bool = False
 
     def rotation(self) -> Floats:
         """Return the rotation (3, 3) of the cap's own frame in the bed frame."""
@@ -147,7 +149,8 @@ def _disc(mushroom: Mushroom, center: Floats, normal: Floats, radius: float, seg
     turn = np.arange(segments) * (2 * np.pi / segments)
     circle = np.stack([np.cos(turn), np.sin(turn), np.zeros(segments)], axis=-1)
     sizes = np.array([0.0, 0.35, 0.75, 1.0])[:, None, None] * radius
-    dent = np.array([-0.12, -0.04, 0.0, 0.0])[:, None, None] * radius * [0, 0, 1]
+    deep = 0.0 if mushroom.fresh else radius  # what was cut some time ago has dried
+    dent = np.array([-0.12, -0.04, 0.0, 0.0])[:, None, None] * deep * [0, 0, 1]
     rotation = turned_to(normal, mushroom.spin)
     return sheet(sizes * circle + dent, Material.CUT).placed(rotation, center)
 

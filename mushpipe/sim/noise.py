@@ -15,7 +15,7 @@ Reals = NDArray[np.floating[Any]]
 
 _PARTS = (
     "plant", "ground", "texture", "ambient", "light", "photo", "photo frame", "fixed pattern",
-    "depth frame", "holes", "lean", "relief", "rubble", "foreign", "sunk", "lids", "old",
+    "depth frame", "holes", "lean", "relief", "rubble", "foreign", "sunk", "lids", "old", "fresh",
 )  # fmt: skip
 
 

@@ -98,6 +98,9 @@ def _seat(settings: SceneSettings, area: Area, share: float, rng: np.random.Gene
     for row, k in enumerate(kind):
         if k == Kind.STUMP:
             height[row] = rng.uniform(0.004, 0.014)
+            if _fresh(settings, k, row):
+                radius[row] *= generator(settings.seed, "fresh", row, 0).uniform(0.9, 1.5)
+                height[row] *= generator(settings.seed, "fresh", row, 1).uniform(0.9, 1.8)
         elif k == Kind.FALLEN:
             height[row] = 0.8 * radius[row]
         elif k == Kind.GROWING and settings.sunk:
@@ -165,6 +168,9 @@ def _grow(
 ) -> Mushroom:
     kind, radius, place = seats.kind[row], float(seats.radius[row]), seats.place[row]
     axis = _axis(settings, kind, seats.lean[row], rng)
+    if _fresh(settings, kind, row):  # cut askew
+        axis = axis + 0.25 * generator(settings.seed, "fresh", row, 2).normal(size=3) * [1, 1, 0]
+        axis /= np.linalg.norm(axis)
     height = float(seats.height[row])
     bend = min(0.75 * height, 0.9 * radius) if kind != Kind.FALLEN else 0.0
     spot = place - bend * axis[:2]
@@ -198,7 +204,14 @@ def _grow(
         0.0 if printed else float(rng.beta(1.1, 2.5)),
         0.03 if printed else float(rng.uniform(0.02, 0.18)),
         0.07 if name == "wood" else 0.0,
+        _fresh(settings, kind, row),
     )
+
+
+def _fresh(settings: SceneSettings, kind: Kind, row: int) -> bool:
+    if kind != Kind.STUMP or not settings.fresh:
+        return False
+    return bool(generator(settings.seed, "fresh", row).random() < settings.fresh)
 
 
 def _lean(seed: int, row: int, radius: float) -> Floats:

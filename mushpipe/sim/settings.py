@@ -39,6 +39,9 @@ class SceneSettings(Group):
     )
     pins: int = Field(40, ge=0, le=300, description="mushrooms too small to pick, in view, about")
     stumps: int = Field(1, ge=0, le=40, description="stems left by a cut, in view, about")
+    fresh: float = Field(
+        0, ge=0, le=1, description="share of stumps cut just now: white and flat, and some larger"
+    )
     fallen: int = Field(0, ge=0, le=40, description="caps lying on their side, in view, about")
     lean: float = Field(0, ge=0, le=1, description="how far stems lean and show beside their caps")
     sunk: float = Field(

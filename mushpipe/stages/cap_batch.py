@@ -47,6 +47,7 @@ from mushpipe.stages.cap_model import (
 )
 from mushpipe.stages.cap_samples import ASTRAY, COMPASS, DIRECTIONS, ray_at
 from mushpipe.stages.cap_solve import ROUND, STAGES, Habit, refine, tilt
+from mushpipe.stages.cap_top import rise
 
 ROUNDNESS = 0.01  # in rim radii: how far the rim of a cap is from the circle of its area
 GUESSED = 0.1  # in rim radii: how far off an outline is that no depth edge confirms,
@@ -221,7 +222,7 @@ def locate(cap: Floats, ray: Vector, covariance: Floats, sigma: float, out: Floa
 
 @borrower
 def describe(fit: Fit, covariance: Floats, cut: float, told: Floats) -> None:
-    """Widen the sigmas by what a fit cannot know of itself, and fill those of tilt and radius.
+    """Widen the sigmas by what a fit cannot know of itself, and fill the rest that follows from it.
 
     Args:
         fit: Of the cap.
@@ -229,7 +230,7 @@ def describe(fit: Fit, covariance: Floats, cut: float, told: Floats) -> None:
         cut: Share of its circle that lies beyond the image.
         told: (TOLD,) surface point and its sigmas, in and out; the rest, out.
     """
-    _, cap, counts = fit
+    rays, cap, counts = fit
     doubt = max(1.0, counts[MISFIT] / POOR)
     guessed = GUESSED * (1.0 - counts[EDGES] / DIRECTIONS) ** SEEN + CUT * cut**2
     if counts[OTHERS] > ASTRAY * (counts[POINTS] + counts[OTHERS]):
@@ -239,8 +240,9 @@ def describe(fit: Fit, covariance: Floats, cut: float, told: Floats) -> None:
     told[SIGMA_TILT] = doubt * np.sqrt(tilts)
     outline = (ROUNDNESS**2 + guessed**2) * cap[RADIUS] ** 2
     told[SIGMA_RADIUS] = doubt * np.sqrt(covariance[5, 5] + outline)
+    height = cap[HEIGHT] + rise(cap, rays, int(counts[POINTS]))
     for i in range(3):
-        told[APEX + i] = cap[i] + cap[HEIGHT] * cap[N + i]
+        told[APEX + i] = cap[i] + height * cap[N + i]
 
 
 def fit_caps(

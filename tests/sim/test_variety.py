@@ -99,6 +99,21 @@ def test_a_deformed_cap_keeps_its_family_and_its_rim_plane() -> None:
         assert replace(other, height=shape.height, form=shape.form, warp=shape.warp) == shape
 
 
+def test_fresh_stumps_are_flat_at_the_cut_and_change_nothing_else() -> None:
+    plain, cut = world(stumps=9), world(stumps=9, fresh=1.0)
+    assert len(plain.mushrooms) == len(cut.mushrooms)
+    for k, (a, b) in enumerate(zip(plain.mushrooms, cut.mushrooms, strict=True)):
+        assert a.kind == b.kind
+        assert b.fresh == (b.kind == Kind.STUMP)
+        if b.kind != Kind.STUMP:
+            assert (a.radius, a.shape, a.stem) == (b.radius, b.shape, b.stem)
+        else:
+            points = cut.vertices[cut.triangles[(cut.owner == k) & (cut.material == Material.CUT)]]
+            assert np.abs((points - b.center) @ b.axis).max() < 1e-6
+    stumps = [m for m in cut.mushrooms if m.kind == Kind.STUMP]
+    assert max(m.radius for m in stumps) > 0.0095
+
+
 def test_old_caps_are_low_and_some_sunk_in_the_middle_and_others_stay_as_they_are() -> None:
     plain, mixed, old = world(), world(old=0.5), world(old=1.0)
     rows = [k for k, m in enumerate(plain.mushrooms) if m.kind == Kind.GROWING]
