@@ -19,11 +19,12 @@ from mushpipe.stages.verifier import package_file, probability, read_models
 
 FILE = "fitted.yaml"
 ROUND = 0.6  # height over radius; a rounder cap is no more, and no less, likely one
-# So flat are lids, cups upside down, paper and cut stumps. Old caps are, too, but look like others,
-# and the detector is sure of them. It is a rule because a regression over standardised features
-# gives rare ones little weight.
+# So flat are lids, cups upside down, paper, pictures and cut stumps. So are old caps, but they look
+# like others, the detector is sure of them, and depth shows their edge. It is a rule because a
+# regression over standardised features gives rare ones little weight.
 FLAT = 0.15  # height over radius,
-ALIKE, PLAIN = 1.0, 0.6  # unless it is less unlike the sure caps, and has a higher score
+ALIKE, PLAIN = 1.0, 0.6  # unless it is less unlike the sure caps, has a higher score,
+EDGED = 5  # and an edge in so many of 32 directions
 FLAT_CHANCE = 0.01
 FIT = ("misfit", "tilt", "aspect", "moved", "resized", "lean")
 NAMES = ("score", *FIT, "unlike")
@@ -75,7 +76,8 @@ def flat(fits: Fits, score: Floats, unlike: Floats) -> Bools:
         unlike: (N,) as in `chances`.
     """
     low = fits.valid & (fits.height < FLAT * fits.radius)
-    return np.asarray(low & ~((unlike < ALIKE) & (score > PLAIN)))
+    plain = (unlike < ALIKE) & (score > PLAIN) & (fits.edges >= EDGED)
+    return np.asarray(low & ~plain)
 
 
 def chances(circles: Circles, unlike: Floats, fits: Fits | None = None) -> Floats:

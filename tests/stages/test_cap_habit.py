@@ -51,23 +51,19 @@ def test_the_variance_of_the_aspect_is_that_of_the_inverse() -> None:
     assert variance_of_aspect(matrix, USUAL) == pytest.approx(expected, rel=1e-9)
 
 
-# high buttons and low caps, as noise at 1.5 and 2.5 mm leaves much to the prior; without what the
-# others say axes are off by 5.4 and 0.9 degrees, apexes by 1.7 and 0.38 mm
-@pytest.mark.parametrize(
-    ("aspect", "noise_mm", "degrees", "apex_mm"), [(0.9, 1.5, 4.5, 1.4), (0.3, 2.5, 0.85, 0.3)]
-)
+# high buttons and low caps, in noise that leaves much to the prior; without what the others say
+# their axes are off by 5.4 and 0.9 degrees
+@pytest.mark.parametrize(("aspect", "noise_mm", "degrees"), [(0.9, 1.5, 4.5), (0.3, 2.5, 0.85)])
 def test_caps_unlike_the_usual_ones_are_known_among_their_like(
-    aspect: float, noise_mm: float, degrees: float, apex_mm: float
+    aspect: float, noise_mm: float, degrees: float
 ) -> None:
     places = [(x, y) for x in (-0.09, -0.03, 0.03, 0.09) for y in (-0.055, 0.0, 0.055)]
     caps = [cap(20, 30 * k, (*place, 0.4), 0.018, aspect) for k, place in enumerate(places)]
     depth, gray = draw(caps, 0.44)
     stage = CapFit(up="camera", edge_offset_px=0, depth_noise_mm=noise_mm, depth_noise_per_m=0)
-    axes, tops = [], []
+    off = []
     for seed in range(4):
         noise = np.random.default_rng(seed).normal(0, noise_mm / 1000, depth.shape)
         poses = stage.process(frame_from(depth + noise, gray), circles_of(caps))[1]
-        axes += [angle(axis, true.axis) for axis, true in zip(poses.axis, caps, strict=True)]
-        tops += [poses.apex - [true.apex for true in caps]]
-    assert np.mean(axes) < degrees
-    assert np.linalg.norm(tops, axis=2).mean() < apex_mm / 1000
+        off += [angle(axis, true.axis) for axis, true in zip(poses.axis, caps, strict=True)]
+    assert np.mean(off) < degrees
