@@ -65,17 +65,6 @@ CONDITIONS: dict[str, dict[str, Any]] = {
         "lean": 0.5,
         "mycelium": 0.8,
     },
-    "late": {
-        "old": 0.8,
-        "cap_color": "mixed",
-        "deform": 0.5,
-        "count": 6,
-        "size_mm": (20, 65),
-        "tilt_deg": (0, 25),
-        "lids": 3,
-        "stumps": 6,
-        "pins": 10,
-    },
 }
 
 # How many frames of each condition a training run takes, seeds from 0 on.
@@ -88,16 +77,14 @@ TRAINING = {
 # How many more of them, for what can learn from rare scenes without forgetting the usual ones.
 MORE = {"near": 2, "lab": 4, "cloth": 2, "paint": 2, "bare": 7, "wood": 2, "lids": 2}
 # How many frames with few caps, of which other things are as many, seeds from `FEW_SEED` on.
-FEW = {"bare": 24, "lab": 8, "cloth": 6, "paint": 6, "wood": 8, "few": 16, "picked": 20,
-       "late": 10, "cut": 8}  # fmt: skip
+FEW = {"bare": 24, "lab": 8, "cloth": 6, "paint": 6, "wood": 8, "few": 16, "picked": 20}
 CHOOSING = {
     "even": 3, "gradient": 3, "dense": 3, "brown": 3, "tilted": 4, "harsh": 2, "near": 1,
     "oblique": 1, "lab": 2, "empty": 1, "bare": 1, "fallen": 2, "wood": 2,
     "low": 3, "lids": 2, "old": 4, "cut": 4,
 }  # fmt: skip
 JUDGED = ("even", "gradient", "dense", "brown", "tilted", "side", "harsh", "lab", "empty", "bare",
-          "fallen", "wood", "low", "lids", "old",
-          "cut")  # fmt: skip
+          "fallen", "wood", "low", "lids", "old", "cut")  # fmt: skip
 CHOOSING_SEED, FEW_SEED, JUDGING_SEED = 900, 2000, 5000
 
 
