@@ -9,8 +9,9 @@ from mushpipe.core.jit import borrower
 from mushpipe.stages.cap_model import BULGE, HEIGHT, RADIUS, N
 from mushpipe.stages.cap_solve import ROUND
 
-NEAR = 0.4  # in rim radii: how far from the axis points tell of the top
-# spread of how far a top is off, in rim radii, and of how that changes with r^2
+# In rim radii: how near the axis points tell of the top, and how far off the dome they are another
+# thing's; least sigma of a point; spread of how far a top is off, and of how that changes with r^2.
+NEAR, OTHER, FINEST = 0.4, 0.3, 0.001
 SUNK, BENT = 0.08, 0.8
 
 
@@ -19,7 +20,8 @@ def rise(cap: Floats, rays: Singles, count: int) -> float:
     """Return how far (m) the points near a cap's axis lie above its dome, at the axis.
 
     With s along the axis from the rim plane and r off it, in rim radii, y = s - h sqrt((1 + b w)^2
-    - r^2), w = 4 r^2 (1 - r^2), is regressed on 1 and r^2. Where no point is near, it is 0.
+    - r^2), w = 4 r^2 (1 - r^2), is regressed on 1 and r^2. Where no point is near, it is 0; what
+    lies on the cap or before it does not count.
 
     Args:
         cap: (15,) the cap.
@@ -39,7 +41,8 @@ def rise(cap: Floats, rays: Singles, count: int) -> float:
         if off < NEAR * NEAR:
             swell = 1.0 + cap[BULGE] * 4.0 * off * (1.0 - off)
             above = along - height * np.sqrt(swell * swell - off)
-            weight = rays[5, j] * (size / rays[4, j]) ** 2
+            counts = abs(above) < OTHER
+            weight = counts * rays[5, j] / max(rays[4, j] / size, FINEST) ** 2
             one, square, fourth = one + weight, square + weight * off, fourth + weight * off * off
             first, second = first + weight * above, second + weight * above * off
     top = (fourth * first - square * second) / (one * fourth - square * square)

@@ -64,6 +64,19 @@ def test_without_points_near_the_axis_the_top_is_the_spheroids() -> None:
     assert rise(parameters(axis), points(axis, R * r, 0 * r, 1e-4), 0) == 0.0
 
 
+def test_what_lies_on_a_cap_is_not_its_top() -> None:
+    axis, r = np.array([0.0, 0.0, -1.0]), np.linspace(0.03, 0.95, 60)
+    above = H * np.sqrt(1 - r**2) + np.where(r < 0.2, 0.35, 0.0)
+    assert abs(rise(parameters(axis), points(axis, R * r, R * above, 1e-4), 60)) < 1e-7
+
+
+def test_depth_without_noise_gives_a_number() -> None:
+    axis, r = np.array([0.0, 0.0, -1.0]), np.linspace(0.03, 0.95, 60)
+    above = H * np.sqrt(1 - r**2) - 0.05
+    found = rise(parameters(axis), points(axis, R * r, R * above, 0.0), 60)
+    assert found == pytest.approx(-0.05 * R, rel=1e-3)
+
+
 @pytest.mark.parametrize(("deep_mm", "lean"), [(2.5, 0.0), (2.5, 12.0), (-1.5, 0.0)])
 def test_the_apex_of_a_cap_that_is_sunk_in_the_middle_is_its_lowest_point(
     deep_mm: float, lean: float
