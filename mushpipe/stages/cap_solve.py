@@ -234,7 +234,7 @@ def refine(
         cap: (15,) the estimate, in and out.
         rays: (6, M) as in `weigh`; the first ROUND lie around the detected circle.
         count: How many columns are rays.
-        habit: How caps stand.
+        habit: How caps grow.
         settings: `Noise`, the angle of a pixel (rad), and the size of the circle at the cap (m).
         first: Number of the first step.
         last: Past the last.
