@@ -51,7 +51,7 @@ COUNTS = 9  # numbers that are kept of a fit:
 # how many points, edge rays and outline rays it has, and points of other depth; the sum of the
 # points' weights; the radius of the circle at the cap, m; misfit; and variances of the tilt, rad^2,
 # per direction, and of the dome's height beside the usual one, m^2. Without points there is no fit.
-POINTS, EDGES, LINES, OTHERS, WEIGHT, EXTENT, MISFIT, TILT, RISE = range(COUNTS)
+POINTS, EDGES, LINES, OTHERS, WEIGHT, EXTENT, MISFIT, TILT, DOME = range(COUNTS)
 
 
 class Frame(NamedTuple):
@@ -213,7 +213,7 @@ def fit_circle(
     ray = ray_at(image, circle[0], circle[1])
     start(cap, axis_of(points, n, habit.up, ray, USUAL[0]), USUAL, ray, middle, size)
     lines, misfit = attempt(frame, circle, rank, size, (rays, count), habit, settings, cap, room)
-    tilt, rise = variance_of_tilt(normal), variance_of_aspect(normal, habit.aspect)
+    tilt, dome = variance_of_tilt(normal), variance_of_aspect(normal, habit.aspect)
     if misfit > POOR:
         take(rival.rays, rays, 0, count)
         leaning = axis_of(points, n, habit.up, ray, CONICAL[0])
@@ -224,12 +224,12 @@ def fit_circle(
             )
             if rest < BETTER * misfit:
                 lines, misfit, tilt = found, rest, variance_of_tilt(normal)
-                rise = variance_of_aspect(normal, habit.aspect)
+                dome = variance_of_aspect(normal, habit.aspect)
                 take(rays, rival.rays, count, ROOM)
                 put(cap, rival.cap)
     if np.isfinite(misfit):
         counts[POINTS], counts[EDGES], counts[LINES], counts[OTHERS] = n, m, lines, other
-        counts[EXTENT], counts[TILT], counts[RISE] = size, tilt, rise
+        counts[EXTENT], counts[TILT], counts[DOME] = size, tilt, dome
     return misfit
 
 

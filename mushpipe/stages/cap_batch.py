@@ -10,6 +10,7 @@ from mushpipe.core.arrays import Bools, Floats, Ints
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.cap_attempt import (
     COUNTS,
+    DOME,
     EDGES,
     EXTENT,
     LINES,
@@ -17,7 +18,6 @@ from mushpipe.stages.cap_attempt import (
     OTHERS,
     POINTS,
     POOR,
-    RISE,
     TILT,
     WEIGHT,
     Fit,
@@ -45,7 +45,8 @@ from mushpipe.stages.cap_model import (
     meet,
     slope,
 )
-from mushpipe.stages.cap_samples import ASTRAY, COMPASS, DIRECTIONS, ray_at
+from mushpipe.stages.cap_regrow import look
+from mushpipe.stages.cap_samples import ASTRAY, DIRECTIONS, ray_at
 from mushpipe.stages.cap_solve import ROUND, STAGES, Habit, refine, tilt
 from mushpipe.stages.cap_top import rise
 
@@ -153,7 +154,7 @@ def fit_all(
     room, n = scratch(*frame.image.depth.shape), len(circles)
     rays = np.empty((n, 6, ROOM), np.float32)
     squares, variances, spreads = np.full(n, -1.0), np.ones(n), np.empty(n)
-    aspects, rises = np.full(n, -1.0), np.ones(n)
+    aspects, domes = np.full(n, -1.0), np.ones(n)
     for i in range(n):
         fit = Fit(rays[i], caps[i], counts[i])
         fit_cap(frame, circles[i], (rank[i], n), habit, settings, fit, room)
@@ -162,9 +163,9 @@ def fit_all(
             squares[i] = first * first + second * second
             variances[i] = counts[i, TILT]
             aspects[i] = caps[i, HEIGHT] / caps[i, RADIUS]
-            rises[i] = counts[i, RISE] / caps[i, RADIUS] ** 2
+            domes[i] = counts[i, DOME] / caps[i, RADIUS] ** 2
     spread_of(squares, variances, habit.spread, spreads)
-    aspect = usual_aspect(aspects, rises, habit.aspect, settings.noise.aspect_sigma)
+    aspect = usual_aspect(aspects, domes, habit.aspect, settings.noise.aspect_sigma)
     for i in range(n):
         if counts[i, POINTS] > 0:
             improved[i] = circles[i]
@@ -178,12 +179,9 @@ def fit_all(
 @borrower
 def beyond(circle: Floats, image: Image) -> float:
     """Return the share of a circle (3,) that lies beyond the image."""
-    height, width = image.depth.shape
     outside = 0
     for j in range(DIRECTIONS):
-        x = circle[0] + circle[2] * COMPASS[j, 0]
-        y = circle[1] + circle[2] * COMPASS[j, 1]
-        outside += not (-0.5 <= x < width - 0.5 and -0.5 <= y < height - 0.5)
+        outside += look(image, circle, j, circle[2])[1] < 0
     return outside / DIRECTIONS
 
 
