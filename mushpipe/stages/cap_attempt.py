@@ -15,7 +15,7 @@ from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.cap_blocks import Cut, Image, Sensor, own_depth, room_to_cut
 from mushpipe.stages.cap_model import HEIGHT, ROOM, SIZE
 from mushpipe.stages.cap_outline import LANES_ROOM, Lanes, expected_reach, sample_outline
-from mushpipe.stages.cap_regrow import denials, regrow
+from mushpipe.stages.cap_regrow import denials, regrow, slack
 from mushpipe.stages.cap_samples import (
     ASTRAY,
     COMPASS,
@@ -169,7 +169,8 @@ def attempt(
         Number of rays along the outline in colour, and the misfit, infinite without a solution.
     """
     gray, image = frame
-    (rays, count), setting, work = seen, (settings.noise, 1.0 / image.focal, size), room.work
+    (rays, count), work = seen, room.work
+    setting = (settings.noise, 1.0 / image.focal, size, slack(image, circle))
     if refine(cap, rays, count, habit, setting, STAGES[0], STAGES[1], work)[0] < 0.0:
         return 0, np.inf
     lines = sample_outline(

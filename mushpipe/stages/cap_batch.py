@@ -27,7 +27,7 @@ from mushpipe.stages.cap_attempt import (
     fit_cap,
     scratch,
 )
-from mushpipe.stages.cap_blocks import CELLS, Image
+from mushpipe.stages.cap_blocks import CELLS
 from mushpipe.stages.cap_circle import improve
 from mushpipe.stages.cap_habit import spread_of, usual_aspect
 from mushpipe.stages.cap_linear import invert
@@ -45,7 +45,7 @@ from mushpipe.stages.cap_model import (
     meet,
     slope,
 )
-from mushpipe.stages.cap_regrow import look
+from mushpipe.stages.cap_regrow import beyond, slack
 from mushpipe.stages.cap_samples import ASTRAY, DIRECTIONS, ray_at
 from mushpipe.stages.cap_solve import ROUND, STAGES, Habit, refine, tilt
 from mushpipe.stages.cap_top import rise
@@ -115,7 +115,7 @@ def second_fit(
     """
     image, (rays, cap, counts), noise = frame.image, fit, settings.noise
     count = ROUND + int(counts[POINTS] + counts[EDGES] + counts[LINES])
-    setting = (noise, 1.0 / image.focal, counts[EXTENT])
+    setting = (noise, 1.0 / image.focal, counts[EXTENT], slack(image, circle))
     counts[WEIGHT], counts[MISFIT] = refine(
         cap, rays, count, habit, setting, STAGES[2], STAGES[3], room.work
     )
@@ -124,7 +124,7 @@ def second_fit(
     improve(circle, cap, held, doubt, image, room.lanes)
     ray = ray_at(image, circle[0], circle[1])
     locate(cap, ray, covariance, noise.circle_px / image.focal, told)
-    describe(fit, covariance, beyond(circle, image), told)
+    describe(fit, covariance, beyond(image, circle), told)
     total = counts[WEIGHT] + counts[MISFIT]
     for value in cap:
         total += value
@@ -174,15 +174,6 @@ def fit_all(
         if not counts[i, POINTS] > 0:
             improved[i] = circles[i]
             caps[i], covariances[i], told[i], counts[i, WEIGHT] = np.nan, np.nan, np.nan, np.nan
-
-
-@borrower
-def beyond(circle: Floats, image: Image) -> float:
-    """Return the share of a circle (3,) that lies beyond the image."""
-    outside = 0
-    for j in range(DIRECTIONS):
-        outside += look(image, circle, j, circle[2])[1] < 0
-    return outside / DIRECTIONS
 
 
 @borrower

@@ -17,6 +17,7 @@ JUMP = 0.35  # in radii of the cap: its depth does not change so much from pixel
 LOST = 6  # px without depth, beyond which nobody knows where a surface ended
 FEWEST = 6  # ends that make a circle
 ROUNDS = 8
+SLACK = 1.2  # in rim radii: how far off the circle of a cap is whose image shows nothing
 HELD = np.array([0.02, 0.02, 0.05])  # weight of the detected x, y and radius, that of an end is 1
 
 
@@ -36,6 +37,24 @@ def look(image: Image, circle: Floats, j: int, far: float) -> tuple[float, int]:
     if 0 <= v < depth.shape[0] and 0 <= u < depth.shape[1]:
         return float(depth[v, u] if depth[v, u] > 0 else 0), int(ranks[v, u])
     return 0.0, -1
+
+
+@borrower
+def beyond(image: Image, circle: Floats) -> float:
+    """Return the share of a circle (3,) that lies beyond the image."""
+    outside = 0
+    for j in range(DIRECTIONS):
+        outside += look(image, circle, j, circle[2])[1] < 0
+    return outside / DIRECTIONS
+
+
+@borrower
+def slack(image: Image, circle: Floats) -> float:
+    """Return how far off (rim radii) a detected circle (3,) may be as the image's border cuts it.
+
+    Detectors take what they see for most of the cap: the radii of such circles are small.
+    """
+    return SLACK * beyond(image, circle) ** 2
 
 
 @borrower

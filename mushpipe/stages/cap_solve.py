@@ -223,7 +223,7 @@ def refine(
     rays: Singles,
     count: int,
     habit: Habit,
-    settings: tuple[Noise, float, float],
+    settings: tuple[Noise, float, float, float],
     first: int,
     last: int,
     work: Work,
@@ -235,7 +235,8 @@ def refine(
         rays: (6, M) as in `weigh`; the first ROUND lie around the detected circle.
         count: How many columns are rays.
         habit: How caps grow.
-        settings: `Noise`, the angle of a pixel (rad), and the size of the circle at the cap (m).
+        settings: `Noise`, the angle of a pixel (rad), the size of the circle at the cap (m), and
+            how far off the circle may be (rim radii).
         first: Number of the first step.
         last: Past the last.
         work: From `workspace`.
@@ -245,13 +246,14 @@ def refine(
     """
     system, flat, rows, weights = work
     normal, gradient = system
-    noise, pixel, size = settings
+    noise, pixel, size, slack = settings
+    outline = noise.outline**2 + slack**2
     total, misfit = 0.0, 0.0
     padded = fill_up(rays, count)
     for step in range(first, last):
         fill_rows(cap, rays, padded, flat)
         total, misfit = weigh(rows, rays, padded, noise, pixel, cap[RADIUS], step, weights)
-        variance = (noise.circle_px * pixel * cap[2]) ** 2 + (noise.outline * cap[RADIUS]) ** 2
+        variance = (noise.circle_px * pixel * cap[2]) ** 2 + outline * cap[RADIUS] ** 2
         weigh_circle(rows, variance, TOUCH_CUTS[min(step, STEPS - 1)], weights)
         multiply(flat, weights, padded, system)
         add_priors(cap, habit, noise, system)

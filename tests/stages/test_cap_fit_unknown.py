@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mushpipe import Camera, Circles, DepthSource, Header, InputError, RgbdFrame
-from mushpipe.stages.cap_batch import beyond
 from mushpipe.stages.cap_fit import CapFit
+from mushpipe.stages.cap_regrow import beyond
 from tests.stages.caps import (
     CAMERA,
     angle,
@@ -122,6 +122,23 @@ def test_the_more_the_border_cuts_off_the_less_is_known() -> None:
     assert tilts[2] > 1.5 * tilts[1] > 2 * tilts[0]
 
 
+@pytest.mark.parametrize("share", [0.8, 0.9])
+@pytest.mark.parametrize("x", [0.16, 0.168])
+def test_a_circle_too_small_for_what_the_border_cuts_off_does_not_hold_its_cap(
+    x: float, share: float
+) -> None:
+    depth, _ = draw([cap(8, 120, (x, 0, 0.4), 0.03, 0.55)], 0.44)
+    center = CAMERA.cx + CAMERA.fx * x / 0.4  # at the border, and a quarter radius beyond
+    v, u = np.mgrid[:240, :320]
+    away = np.hypot(u - center, v - CAMERA.cy)
+    depth[(away > 24) & (away < 45)] = np.nan  # and no edge shows where it ends
+    frame = frame_from(depth, np.full(depth.shape, 0.4))
+    # as detectors have it: it touches the rim that is seen
+    small = Circles([[center - (1 - share) * 30, CAMERA.cy]], [share * 30], [1.0])
+    locations, *_ = CapFit(up=(0, 0, -1)).process(frame, small)
+    assert locations.diameter[0] == pytest.approx(0.06, rel=0.07)
+
+
 @given(st.floats(0, 400), st.floats(0, 300), st.floats(5, 60))
 def test_the_share_of_a_circle_beyond_the_image_is_that_of_its_arc(
     x: float, y: float, radius: float
@@ -131,7 +148,7 @@ def test_the_share_of_a_circle_beyond_the_image_is_that_of_its_arc(
     u, v = x + radius * np.cos(turn), y + radius * np.sin(turn)
     out = (u < -0.5) | (v < -0.5) | (u > CAMERA.width - 0.5) | (v > CAMERA.height - 0.5)
     # of 32 directions; at each end of an arc one may be in or out
-    assert beyond(np.array([x, y, radius]), image) == pytest.approx(out.mean(), abs=4 / 32)
+    assert beyond(image, np.array([x, y, radius])) == pytest.approx(out.mean(), abs=4 / 32)
 
 
 def test_an_upright_without_direction_is_refused() -> None:
