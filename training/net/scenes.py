@@ -23,6 +23,7 @@ TRAINING_SEED, TABLES_SEED, WORN_SEED = 200_000, 201_000, 202_000
 VALIDATION_SEED, JUDGING_SEED = 300_000, 400_000
 VERIFIER_SEED, CHOOSING_SEED = 500_000, 510_000  # family a
 TRAINING, VALIDATION = 640, 60
+REFINING = {TRAINING_SEED: 200, TABLES_SEED: 120, WORN_SEED: 420}  # frames from each seed on
 
 
 @dataclass(frozen=True)
@@ -176,11 +177,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cache", type=Path, default=Path("out/net"), help="rendered frames")
     parser.add_argument("--frames", type=int, default=TRAINING, help="to train on")
+    parser.add_argument("--refining", action="store_true", help="those of training.net.refined")
     parser.add_argument("--part", type=int, default=0, help="this process' number")
     parser.add_argument("--of", type=int, default=1, help="how many processes share the work")
     arguments = parser.parse_args()
-    seeds = [*range(VALIDATION_SEED, VALIDATION_SEED + VALIDATION)]
-    seeds += range(TRAINING_SEED, TRAINING_SEED + arguments.frames)
+    counts = REFINING if arguments.refining else {TRAINING_SEED: arguments.frames}
+    counts = {VALIDATION_SEED: VALIDATION} | counts
+    seeds = [seed for first, count in counts.items() for seed in range(first, first + count)]
     for seed in seeds[arguments.part :: arguments.of]:
         picture(seed, arguments.cache)
 
