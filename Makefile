@@ -63,20 +63,19 @@ verifier: $(STAMP)-dev system-libraries
 
 # Networks of `cap-net`. `train-taught` makes the one that ships: three seeds taught by a large one,
 # eleven minutes of training on a GPU that PyTorch knows, beside 15 cores that cut crops, and joined
-# into one, which `train-refined` trains on with late beds and worn caps, within an hour on two cores;
-# START=FILE.onnx for another than that one. `train` makes one from nothing on two cores within an hour: frames, network, figures;
+# into one. `train` makes one from nothing on two cores within an hour: frames, network, figures;
 # `train-seeds` adds two that tell how much chance there is. There a training takes one core, and half
 # of another to cut its crops; meanwhile the one that ships is judged, which renders the frames for
 # it. PyTorch for the CPU comes from PyTorch's own index; elsewhere `torch` would bring CUDA along.
 NET := out/net
 CORES := $(shell nproc)
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
-render = for part in $$(seq $(CORES)); do $(BIN)/python -m training.net.scenes $(1) \
+render = for part in $$(seq $(CORES)); do $(BIN)/python -m training.net.scenes --frames $(1) \
   --part $$((part - 1)) --of $(CORES) & pids="$$pids $$!"; done; for pid in $$pids; do wait $$pid || exit 1; done
-.PHONY: train train-seeds train-taught train-refined
+.PHONY: train train-seeds train-taught
 train: $(STAMP) system-libraries
 	$(BIN)/pip install --quiet --editable '.[train]' --extra-index-url $(TORCH_INDEX)
-	$(call render,--frames 640)
+	$(call render,640)
 	nice $(BIN)/python -m training.net.judge > $(NET)/shipped.txt & \
 	  OMP_NUM_THREADS=1 $(MAKE) --always-make $(NET)/seed-1.onnx && wait
 	$(BIN)/python -m training.net.judge --peers --models $(NET)/seed-1.onnx
@@ -87,21 +86,13 @@ train-seeds: train
 
 train-taught: $(STAMP) system-libraries
 	$(BIN)/pip install --quiet --editable '.[train]'
-	$(call render,--frames 2000)
+	$(call render,2000)
 	$(BIN)/python -m training.net.taught --out $(NET)
 	$(BIN)/python -m training.net.joined --weights $(NET)/taught-1.pt $(NET)/taught-0.pt $(NET)/taught-2.pt
 	for name in taught-0 taught-1 taught-2 joined; do $(BIN)/python -m training.net.export \
 	  --weights $(NET)/$$name.pt --out $(NET)/$$name.onnx || exit 1; done
-	$(MAKE) train-refined
-	$(BIN)/python -m training.net.judge --peers --models $(NET)/taught-0.onnx $(NET)/taught-1.onnx \
-	  $(NET)/taught-2.onnx $(NET)/joined.onnx $(NET)/refined.onnx
-
-START ?= $(NET)/joined.onnx
-train-refined: $(STAMP) system-libraries
-	$(BIN)/pip install --quiet --editable '.[train]' --extra-index-url $(TORCH_INDEX)
-	$(call render,--refining)
-	$(BIN)/python -m training.net.refined --start $(START)
-	$(BIN)/python -m training.net.export --weights $(NET)/refined.pt --out $(NET)/refined.onnx
+	$(BIN)/python -m training.net.judge --peers \
+	  --models $(NET)/taught-0.onnx $(NET)/taught-1.onnx $(NET)/taught-2.onnx $(NET)/joined.onnx
 
 $(NET)/seed-%.onnx:
 	$(BIN)/python -m training.net.train --seed $* --out $(NET)/seed-$*.pt

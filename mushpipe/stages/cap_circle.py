@@ -15,11 +15,13 @@ from mushpipe.core.jit import borrower
 from mushpipe.stages.cap_blocks import Image
 from mushpipe.stages.cap_model import Vector
 from mushpipe.stages.cap_outline import Lanes, expected_reach
+from mushpipe.stages.cap_regrow import beyond
 from mushpipe.stages.cap_samples import COMPASS, DIRECTIONS
 
 CLEAR = 0.8  # weight of a detected circle whose outline the image shows all around
 APART = 0.15  # distance of the two centres, in radii, at which that weight is halved
-HELD = 16  # rays along depth edge and outline that hold a cap; with fewer it moves the circle less
+HELD = 16  # rays along depth edge and outline that hold a cap; with fewer it moves the circle less;
+FEWEST = 0.25  # fewer do where the border cuts the circle: of them this share at least
 
 
 @borrower
@@ -66,6 +68,7 @@ def improve(
     outline = circle_around(circle, room[0])
     apart = np.hypot(outline[0] - circle[0], outline[1] - circle[1]) / (APART * outline[2])
     step = 1.0 - CLEAR * held[1] / DIRECTIONS / (1.0 + apart * apart)
-    step *= min(1.0, (held[0] + held[1]) / HELD) ** 2 / doubt
+    seen = max(1.0 - beyond(image, circle), FEWEST)
+    step *= min(1.0, (held[0] + held[1]) / (HELD * seen)) ** 2 / doubt
     for i in range(3):
         circle[i] += step * (outline[i] - circle[i])

@@ -101,3 +101,16 @@ def test_a_cap_that_nothing_holds_does_not_move_its_circle() -> None:
     assert moved[0] == pytest.approx(3.0, abs=0.15)
     assert moved[1] < 1.1
     assert moved[2] < 0.2
+
+
+def test_where_the_border_cuts_a_cap_fewer_rays_hold_it() -> None:
+    moved = []
+    image = image_of(np.zeros((240, 320)))
+    for x in (0.0, 0.16):  # in the middle; and half of it beyond the right border
+        true = cap(0, 0, (x, 0, 0.4), 0.022, 0.55)
+        outline = np.array([CAMERA.cx + CAMERA.fx * x / 0.4, CAMERA.cy, CAMERA.fx * 0.022 / 0.4])
+        circle = outline - [4.0, 0.0, 4.0]
+        improve(circle, parameters(true), (8.0, 0.0), 1.0, image, ROOM)
+        moved.append(circle[2] - outline[2] + 4.0)
+    assert moved[0] == pytest.approx(1.0, abs=0.3)  # half of what would hold it: a quarter
+    assert moved[1] > 2.5

@@ -9,7 +9,7 @@ from mushpipe.core.arrays import Bools, Floats, Singles
 from mushpipe.core.truth import Ignore
 from mushpipe.stages.cap_decode import CHANNELS, HEAT, MASK, OFFSET, RADIUS, STRIDE
 from training.net.scenes import Picture
-from training.net.texture import NOISE, textured, worn
+from training.net.texture import NOISE, textured
 
 SMALLEST = 5.0  # px; smaller outlines are not asked for
 HIDDEN = 0.3  # nor are those of which less is seen
@@ -23,7 +23,6 @@ def crop(
     near: float = 0.0,
     stained: bool = False,
     surfaces: bool = False,
-    late: bool = False,
 ) -> tuple[Singles, Singles, Singles]:
     """Return an image (3, size, size) in 0..1, its target (5, h, w) and weight (h, w).
 
@@ -34,7 +33,6 @@ def crop(
         near: Share of the crops that are taken around a cap; the others lie anywhere.
         stained: Whether caps and bed may be blotched, overexposed, and set one against the other.
         surfaces: Whether they may have other surfaces, shade each other, and be blurred more.
-        late: Whether they may be `worn` as well. All else is drawn the same then.
     """
     matrix, scale = _placement(picture, size, rng, near)
     color = cv2.warpAffine(
@@ -47,8 +45,6 @@ def crop(
     circles = np.column_stack([center, picture.circles[:, 2] * scale])
     if surfaces:
         image = textured(image, cap, circles, rng)
-    if late:
-        image = worn(image, cap, circles, rng.spawn(1)[0])
     image = photographed(image, cap, rng, stained, surfaces)
     stump = picture.kind == Ignore.CUT_STUMP
     target, weight = aims(circles[~stump], (picture.visible < HIDDEN)[~stump], size // STRIDE)

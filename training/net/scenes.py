@@ -19,11 +19,9 @@ from mushpipe.core.truth import INSTANCES_TOPIC, TRUTH_TOPIC, Ignore, Instances,
 from mushpipe.sources.synthetic import SyntheticSource
 from training.scenes import Case, stored
 
-TRAINING_SEED, TABLES_SEED, WORN_SEED = 200_000, 201_000, 202_000
-VALIDATION_SEED, JUDGING_SEED = 300_000, 400_000
+TRAINING_SEED, TABLES_SEED, VALIDATION_SEED, JUDGING_SEED = 200_000, 201_000, 300_000, 400_000
 VERIFIER_SEED, CHOOSING_SEED = 500_000, 510_000  # family a
 TRAINING, VALIDATION = 640, 60
-REFINING = {TRAINING_SEED: 200, TABLES_SEED: 120, WORN_SEED: 420}  # frames from each seed on
 
 
 @dataclass(frozen=True)
@@ -49,8 +47,6 @@ def settings(seed: int) -> dict[str, Any]:
     """Draw the settings of a scene.
 
     A quarter of them are tables; half, from `TABLES_SEED` on in the training: there is less on one.
-    From `WORN_SEED` on in the training beds are late ones, with old caps and fresh stumps, and
-    there is more on tables than caps.
     """
     rng = np.random.default_rng([seed, 8])
 
@@ -62,7 +58,7 @@ def settings(seed: int) -> dict[str, Any]:
 
     distance, small, tilt = log(0.28, 0.85), rng.uniform(10, 30), rng.uniform(0, 15)
     count = 0 if rng.random() < 0.05 else log(6, 120) * (distance / 0.5) ** 2
-    lab = rng.random() < (0.5 if TABLES_SEED <= seed < WORN_SEED else 0.25)
+    lab = rng.random() < (0.5 if TABLES_SEED <= seed < VALIDATION_SEED else 0.25)
     drawn = {
         "seed": seed,
         "max_frames": 1,
@@ -103,26 +99,7 @@ def settings(seed: int) -> dict[str, Any]:
     if lab and rng.random() < 0.5:  # models turned from wood
         drawn |= {"cap_color": "wood", "printed": True, "table": "wood"}
         drawn |= {"count": int(rng.integers(3, 25)), "size_mm": (small + 10, small + 50)}
-    drawn |= {"sunk": some(0.4, 1), "lids": round(some(0.3, 10))}
-    late = WORN_SEED <= seed < VALIDATION_SEED
-    return drawn | (_crowded(seed) if lab else _worn(seed)) if late else drawn
-
-
-def _worn(seed: int) -> dict[str, Any]:
-    """Draw what has become of a bed on which was picked, and of the caps that were left."""
-    rng = np.random.default_rng([seed, 9])
-    late = {"stumps": int(rng.integers(0, 25)), "fresh": float(rng.uniform(0, 1))}
-    if rng.random() < 0.5:
-        late |= {"old": float(rng.uniform(0.2, 1)), "count": int(rng.integers(0, 50))}
-    if rng.random() < 0.4:
-        late["mycelium"] = 1.0
-    return late
-
-
-def _crowded(seed: int) -> dict[str, Any]:
-    """Draw how many caps and other things are on a table with few caps."""
-    rng = np.random.default_rng([seed, 10])
-    return {"count": int(rng.integers(0, 9)), "clutter": int(rng.integers(6, 17))}
+    return drawn | {"sunk": some(0.4, 1), "lids": round(some(0.3, 10))}
 
 
 def picture(seed: int, cache: Path) -> Picture:
@@ -177,13 +154,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cache", type=Path, default=Path("out/net"), help="rendered frames")
     parser.add_argument("--frames", type=int, default=TRAINING, help="to train on")
-    parser.add_argument("--refining", action="store_true", help="those of training.net.refined")
     parser.add_argument("--part", type=int, default=0, help="this process' number")
     parser.add_argument("--of", type=int, default=1, help="how many processes share the work")
     arguments = parser.parse_args()
-    counts = REFINING if arguments.refining else {TRAINING_SEED: arguments.frames}
-    counts = {VALIDATION_SEED: VALIDATION} | counts
-    seeds = [seed for first, count in counts.items() for seed in range(first, first + count)]
+    seeds = [*range(VALIDATION_SEED, VALIDATION_SEED + VALIDATION)]
+    seeds += range(TRAINING_SEED, TRAINING_SEED + arguments.frames)
     for seed in seeds[arguments.part :: arguments.of]:
         picture(seed, arguments.cache)
 

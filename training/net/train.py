@@ -47,7 +47,7 @@ class Crops(IterableDataset[Batch]):
             rows = [self._cut(self._frames[k], rng) for k in picks]
             yield tuple(torch.from_numpy(np.stack(part)) for part in zip(*rows, strict=True))
 
-    def _cut(self, frame: Picture, rng: np.random.Generator) -> tuple[Singles, ...]:
+    def _cut(self, frame: Picture, rng: np.random.Generator) -> tuple[Singles, Singles, Singles]:
         share = self._stained  # all or none takes no draw: seeds of `main` keep their crops
         stained = share == 1 or (share > 0 and rng.random() < share)
         return crop(frame, SIZE, rng, NEAR, stained, self._surfaces)
