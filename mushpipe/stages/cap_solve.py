@@ -247,13 +247,13 @@ def refine(
     system, flat, rows, weights = work
     normal, gradient = system
     noise, pixel, size, slack = settings
-    outline = noise.outline**2 + slack**2
+    astray = noise.outline**2 + slack**2  # variance, in rim radii
     total, misfit = 0.0, 0.0
     padded = fill_up(rays, count)
     for step in range(first, last):
         fill_rows(cap, rays, padded, flat)
         total, misfit = weigh(rows, rays, padded, noise, pixel, cap[RADIUS], step, weights)
-        variance = (noise.circle_px * pixel * cap[2]) ** 2 + outline * cap[RADIUS] ** 2
+        variance = (noise.circle_px * pixel * cap[2]) ** 2 + astray * cap[RADIUS] ** 2
         weigh_circle(rows, variance, TOUCH_CUTS[min(step, STEPS - 1)], weights)
         multiply(flat, weights, padded, system)
         add_priors(cap, habit, noise, system)
