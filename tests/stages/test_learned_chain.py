@@ -22,6 +22,7 @@ RADII = (8.0, 45.0)
 BARE = {"scene": "lab", "count": 1, "clutter": 12}
 
 
+@pytest.mark.slow
 def test_more_brown_caps_among_rubble_are_found_than_by_the_net_alone_and_refitted() -> None:
     settings = {"cap_color": "brown", "soil": 3.0, "rubble": 50, "relief_mm": 3.0, "count": 40}
     alone, both = Score(), Score()
@@ -97,6 +98,7 @@ def test_caps_of_hundreds_of_pixels_are_found_in_an_image_of_millions() -> None:
     assert np.mean(seen) > 0.85
 
 
+@pytest.mark.slow
 def test_one_cap_among_clutter_is_found_without_depth_and_hardly_a_cup_with_it() -> None:
     net = CapNet(radius_px=(8, None), min_score=0.05)
     detect, score = PhaseHough(radius_px=(8, None), use_learned=True), Score()
