@@ -81,11 +81,12 @@ def detector() -> tuple[CapNet, PhaseHough, CapFit]:
 def found_in(frame: RgbdFrame) -> Circles:
     """Return the circles that are taken for caps, as they were detected."""
     net, detect, pose = detector()
-    circles = detect.process(frame, *net.process(frame))
+    mask, learned = net.process(frame)
+    circles = detect.process(frame, mask, learned)
     if not len(circles) or frame.camera is None:
         return circles
     fits = pose.fit(frame.gray, frame.depth_m, frame.camera, circles)
-    return circles.take(pose.scores(frame, circles, fits) >= (pose.min_score or 0.0))
+    return circles.take(pose.scores(frame, circles, fits, learned) >= (pose.min_score or 0.0))
 
 
 def detected(frame: RgbdFrame) -> tuple[Circles, np.ndarray]:

@@ -20,9 +20,9 @@ from mushpipe import Circles, RgbdFrame
 from mushpipe.core.arrays import Bools, Floats
 from mushpipe.core.truth import Ignore, Truth
 from mushpipe.evaluate.matching import circle_iou
-from mushpipe.stages.cap_fit import CapFit
+from mushpipe.stages.cap_fit import CapFit, seen_by
 from mushpipe.stages.cap_kin import kin_of, unlike
-from mushpipe.stages.cap_verify import FILE, FIT, MODELS, NAMES, features, flat
+from mushpipe.stages.cap_verify import BESIDE, FILE, FIT, MODELS, NAMES, features, flat
 from mushpipe.stages.phase_hough import PhaseHough
 from mushpipe.stages.verifier import LIMIT
 from training.harder import harder
@@ -37,27 +37,28 @@ NEUTRAL = 0.3  # IoU with a mushroom that need not be found, from which on a cir
 SETTINGS = [
     {"use_learned": net, "use_depth": deep} for deep in (True, False) for net in (False, True)
 ]
-FEW = "fitted_few"
-SQUARED = {FEW: ("misfit", "tilt", "aspect", "lean")}
-# What `fitted_few` is asked about are caps by so much; a share of half, as in its training, loses
-# caps that a stereo camera shows badly, and 0.91, as in all scenes, keeps cups.
-SHARE = {FEW: 0.85}
+FEW = ("fitted_few", "fitted_few" + BESIDE)
+SQUARED = ("misfit", "tilt", "aspect", "lean")  # for these
+# What they are asked about are caps by so much; a share of half, as in their training, loses caps
+# that a stereo camera shows badly, and 0.91, as in all scenes, keeps cups.
+SHARE = 0.85
+KNOWN = (FIT[0], "unlike", "learned")  # in some samples, and not in others
 STAGES = [PhaseHough(radius_px=RADII, min_score=LEAST, **each) for each in SETTINGS]
 HEAD = """\
-# The verifier of the stage `cap-fit`: logistic regressions over what the fit found and over how
-# like other caps a circle looks, made by `make verifier` from simulated scenes alone. A feature x
-# (docs/detection.md says what each is) adds  weight z + square z^2  to the logit, with
-# z = (x - mean) / scale, clipped to -4..4.
+# The verifier of the stage `cap-fit`: logistic regressions over what the fit found, over how like
+# other caps a circle looks and, in those called `_learned`, over what a network sees there; made by
+# `make verifier` from simulated scenes alone. A feature x (docs/detection.md says what each is)
+# adds  weight z + square z^2  to the logit, with z = (x - mean) / scale, clipped to -4..4.
 """
 
 
-def detected(frame: RgbdFrame) -> Iterator[tuple[Circles, bool]]:
-    """Yield the circles of the detector alone and beside the network, and whether with depth."""
+def detected(frame: RgbdFrame) -> Iterator[tuple[Circles, bool, Circles | None]]:
+    """Yield the circles of the detector, whether it had depth, and those of the network, if any."""
     alone, bare = segmentations(frame)[0], replace(frame, depth=None)
     beside = {deep: (seen, *NET.process(seen)) for deep, seen in ((True, frame), (False, bare))}
     for stage in STAGES:
-        ready = beside[stage.use_depth] if stage.use_learned else alone
-        yield stage.process(*ready), stage.use_depth
+        ready = beside[stage.use_depth] if stage.use_learned else (*alone, None)
+        yield stage.process(*ready), stage.use_depth, ready[2]
 
 
 def labels(circles: Circles, truth: Truth, stumps: bool = False) -> Floats:
@@ -81,13 +82,13 @@ def samples(cases: Iterable[Case], stumps: bool = False) -> tuple[Floats, Floats
         for frame in (case.frame, harder(case, rng).frame):
             if frame.camera is None or frame.depth is None:
                 continue
-            for circles, deep in detected(frame):
+            for circles, deep, learned in detected(frame):
                 fits = stage.fit(frame.gray, frame.depth_m, frame.camera, circles) if deep else None
                 use = np.isfinite(label := labels(circles, case.truth, stumps))
-                other = unlike(kin_of(frame.color, circles))
+                other, seen = unlike(kin_of(frame.color, circles)), seen_by(learned, circles)
                 if fits is not None:
-                    use &= fits.valid & ~flat(fits, circles.score, other)
-                rows.append(features(circles, other, fits)[use])
+                    use &= fits.valid & ~flat(fits, circles.score, other, seen)
+                rows.append(features(circles, other, fits, seen)[use])
                 right.append(label[use])
     return np.concatenate(rows), np.concatenate(right)
 
@@ -95,13 +96,14 @@ def samples(cases: Iterable[Case], stumps: bool = False) -> tuple[Floats, Floats
 def teaches(rows: Floats, model: str) -> Bools:
     """Return which rows (N, F) teach a model: those of which it is asked.
 
-    What is fitted is for the models of fits, and all others for the one without.
+    What is fitted is for the models of fits, all else for those without; and what was found beside
+    the network for those beside it.
     """
-    fitted, alike = np.isfinite(rows[:, [NAMES.index(FIT[0]), NAMES.index("unlike")]]).T
-    if model == FEW:
-        return np.asarray(fitted & ~alike)
     names = MODELS[model]
-    use = fitted if FIT[0] in names else ~fitted
+    fitted, alike, beside = np.isfinite(rows[:, [NAMES.index(name) for name in KNOWN]]).T
+    use = (fitted == (FIT[0] in names)) & (beside == ("learned" in names))
+    if model in FEW:
+        return np.asarray(use & ~alike)
     return np.asarray(use & np.isfinite(rows[:, [NAMES.index(name) for name in names]]).all(axis=1))
 
 
@@ -116,12 +118,13 @@ def main() -> None:
     varied = varied_cases(cache, VERIFIER_SEED, "a", VARIED)
     usual = samples(chain(training_cases(cache), more_cases(cache), varied))
     few = samples(few_cases(cache), stumps=True)
+    all_of_them = tuple(map(np.concatenate, zip(usual, few, strict=True)))
     models = {}
     for model, names in MODELS.items():
-        taught = tuple(map(np.concatenate, zip(usual, few, strict=True))) if model == FEW else usual
+        chosen = (all_of_them, SQUARED, SHARE) if model in FEW else (usual, (), None)
+        taught, squared, share = chosen
         rows, right = (part[teaches(taught[0], model)] for part in taught)
         table = rows[:, [NAMES.index(name) for name in names]]
-        squared, share = SQUARED.get(model, ()), SHARE.get(model)
         models[model] = fit(table, right, names, arguments.ridge, LIMIT, squared, share)
         print(f"{model}: {len(table)} circles, {right.mean():.2f} right")
     write(models, arguments.out, HEAD)

@@ -39,9 +39,9 @@ class Detector(Protocol):
 CAP_FIT = CapFit(min_score=0.5)
 
 
-def kept(frame: RgbdFrame, circles: Circles) -> Circles:
-    """Return the circles that `cap-fit` takes for caps, improved."""
-    return CAP_FIT.process(frame, circles)[2]
+def kept(frame: RgbdFrame, circles: Circles, learned: Circles | None = None) -> Circles:
+    """Return the circles that `cap-fit` takes for caps, improved; `learned` are of `cap-net`."""
+    return CAP_FIT.process(frame, circles, learned)[2]
 
 
 class Fitted:

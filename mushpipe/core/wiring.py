@@ -1,4 +1,8 @@
-"""Who feeds whom: an input takes the nearest producer of its type above it in the file."""
+"""Who feeds whom: an input takes the nearest producer of its type above it in the file.
+
+An optional input does not take what another one of the same plugin takes already, unless the graph
+or a setting asks for it: a second look at the same is no news.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +31,7 @@ def wire(document: Document, registry: Registry, nodes: list[Node]) -> list[Prob
             at = (*_place(node), "inputs", name)
             hint = suggest(name, [port.name for port in node.ports.inputs])
             problems.append(document.problem(at, f"'{node.use}' has no input '{name}'", hint, True))
-        for port in node.ports.inputs:
+        for port in sorted(node.ports.inputs, key=lambda port: not port.required):
             if port.type is Trace and node.kind == "sink":
                 if port.name in node.asked:
                     at = (*_place(node), "inputs", port.name)
@@ -51,12 +55,10 @@ def _connect(
     nodes: list[Node],
 ) -> Problem | None:
     wanted = node.asked.get(port.name)
-    for other in reversed(above):
-        if wanted in (None, other.name):
-            for index, produced in enumerate(other.ports.outputs):
-                if issubclass(produced, port.type):
-                    node.links[port.name] = Link(other.name, index)
-                    return None
+    link = _nearest(port, wanted, above)
+    if link and (wanted or port.required or link not in node.links.values()):
+        node.links[port.name] = link
+        return None
     at = _place(node)
     if wanted is not None:
         message = _why_not(node, port, wanted, above, nodes)
@@ -67,9 +69,21 @@ def _connect(
     except Exception as error:  # of a plugin
         message = f"'{node.use}': its required_inputs() failed: {type(error).__name__}: {error}"
         return document.problem(at, message, key=True)
+    if link:
+        node.links[port.name] = link
+        return None
     message = f"nothing above '{node.name}' produces the {port.type.__name__} of its '{port.name}'"
     hint = _namesake(port, above) or _who_produces(registry, port)
     return document.problem(at, message, hint, key=True)
+
+
+def _nearest(port: Port, wanted: str | None, above: list[Node]) -> Link | None:
+    for other in reversed(above):
+        if wanted in (None, other.name):
+            for index, produced in enumerate(other.ports.outputs):
+                if issubclass(produced, port.type):
+                    return Link(other.name, index)
+    return None
 
 
 def _check_names(document: Document, nodes: list[Node]) -> list[Problem]:

@@ -30,6 +30,7 @@ from mushpipe.stages.cap_order import Order, by_depth
 from mushpipe.stages.cap_solve import Habit, Noise
 from mushpipe.stages.cap_verify import chances
 from mushpipe.stages.discs import discs_of
+from mushpipe.stages.phase_learned import agreement
 from mushpipe.stages.surface_fit import fit_tops, sources, variance_along, without_tip
 from mushpipe.stages.upright import Up, pixel_rays, upright
 from mushpipe.stages.warm_up import example_circles, example_frame
@@ -46,8 +47,9 @@ class CapFit(Stage):
     they cover. Over a hole at the centre the position is that of `surface-fit`. Where tilt cannot
     be seen the sigma says so. A mushroom with hardly any depth is ``missing`` and has no pose.
     Circles are handed on improved: drawn to the outline of the fitted cap where the image shows
-    little of it. With `min_score` it decides, too, which of them are caps: by their fits, and by
-    how they look beside the others, for which it needs no depth.
+    little of it. With `min_score` it decides, too, which of them are caps: by their fits, by how
+    they look beside the others, for which it needs no depth, and by what a network sees there whose
+    circles it is given as well.
     """
 
     up: Up = "bed"
@@ -83,23 +85,32 @@ class CapFit(Stage):
         frame, circles = example_frame(), example_circles()
         self.process(frame, circles)
         if self.min_score is not None:
-            self.scores(frame, circles.take(np.zeros(FEWEST, np.intp)))
+            self.scores(frame, circles.take(np.zeros(FEWEST, np.intp)), learned=circles)
         self._edges = EdgeWatch()
 
-    def process(self, frame: RgbdFrame, circles: Circles) -> tuple[Locations, Poses, Circles]:
+    def process(
+        self, frame: RgbdFrame, circles: Circles, learned: Circles | None = None
+    ) -> tuple[Locations, Poses, Circles]:
         """Return one location and one pose per circle, and the circles, improved.
+
+        Args:
+            frame: What they were found in, with depth if there is any.
+            circles: As detected.
+            learned: Circles of `cap-net`, as evidence; nothing without `min_score`.
 
         Raises:
             InputError: The frame has depth but no calibration.
         """
         if frame.depth is None or not len(circles):
             unknown = Locations.unknown(len(circles)), Poses.unknown(len(circles))
-            scored = Circles(circles.center, circles.radius, self.scores(frame, circles))
+            scored = Circles(
+                circles.center, circles.radius, self.scores(frame, circles, None, learned)
+            )
             return self._kept(*unknown, scored)
         camera, depth = calibration_of(frame), frame.depth_m
         order = by_depth(depth, discs_of(circles))
         fits = self.fit(frame.gray, depth, camera, circles, order)
-        score = self.scores(frame, circles, fits)
+        score = self.scores(frame, circles, fits, learned)
         circles = Circles(fits.circle[:, :2], fits.circle[:, 2], score)
         source = np.where(fits.valid, sources(circles, depth), DepthSource.MISSING)
         holes = np.flatnonzero(source == DepthSource.NEIGHBOURS)
@@ -109,18 +120,25 @@ class CapFit(Stage):
         self._edges.look(frame, found[-1], self.edge_offset_px)
         return found
 
-    def scores(self, frame: RgbdFrame, circles: Circles, fits: Fits | None = None) -> Floats:
+    def scores(
+        self,
+        frame: RgbdFrame,
+        circles: Circles,
+        fits: Fits | None = None,
+        learned: Circles | None = None,
+    ) -> Floats:
         """Return how likely circles (N,) are caps; without `min_score` the scores they have.
 
         Args:
             frame: What they were found in.
             circles: As detected, with the scores of `phase-hough`.
             fits: The caps fitted in them; None without depth.
+            learned: Circles of `cap-net`, if there is one.
         """
         if self.min_score is None:
             return circles.score
         kin = kin_of(frame.color, circles)
-        chance = chances(circles, unlike(kin), fits)
+        chance = chances(circles, unlike(kin), fits, seen_by(learned, circles))
         return np.where(clods(frame.color, circles, kin), np.minimum(chance, CLOD_CHANCE), chance)
 
     def _kept(
@@ -200,6 +218,14 @@ class CapFit(Stage):
         along = variance_along(without_tip(*tops)[0], tops[1], size, pixel)
         fits.surface[rows] = points[fitted]
         fits.sigma_surface[rows, 2] = np.maximum(fits.sigma_surface[rows, 2], np.sqrt(along))
+
+
+def seen_by(learned: Circles | None, circles: Circles) -> Floats | None:
+    """Return how far each circle (N,) is one of a network; None where there is no network."""
+    if learned is None:
+        return None
+    # a copy, for what is read-only needs another kernel
+    return agreement(discs_of(circles), np.array(circles.radius), learned)
 
 
 def _locations(fits: Fits, source: Bytes) -> Locations:

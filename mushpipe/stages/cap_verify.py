@@ -2,8 +2,8 @@
 
 How well a spheroid fits, how surely it leans as it does, whether its form is a cap's and its place
 the circle's: stones, stems, paper and parts of caps seldom fit. And whether it looks like the caps
-around it: clods do not. The logistic regressions stand in `fitted.yaml`; `training/fitted.py` makes
-them.
+around it: clods do not. And, beside a network, what that sees there. The logistic regressions stand
+in `fitted.yaml`; `training/fitted.py` makes them.
 """
 
 from __future__ import annotations
@@ -24,33 +24,46 @@ ROUND = 0.6  # height over radius; a rounder cap is no more, and no less, likely
 # regression over standardised features gives rare ones little weight.
 FLAT = 0.15  # height over radius,
 ALIKE, PLAIN = 1.0, 0.6  # unless it is less unlike the sure caps, has a higher score,
-EDGED = 5  # and an edge in so many of 32 directions
+EDGED = 5  # and an edge in so many of 32 directions;
+KINDRED, SEEN = 0.2, 0.7  # or is just like them, and a network sees it so plainly
 FLAT_CHANCE = 0.01
+LEAST_SEEN = 0.005
 FIT = ("misfit", "tilt", "aspect", "moved", "resized", "lean")
-NAMES = ("score", *FIT, "unlike")
+NAMES = ("score", *FIT, "unlike", "learned")
+BESIDE = "_learned"  # ends the name of a model beside a network
 # What is known decides which model is asked; each is over some of these features.
-MODELS = {
-    "fitted": NAMES[:-1],
-    "fitted_kin": NAMES,
-    "fitted_few": NAMES[:-1],  # where few circles are surely caps
+ALONE = {
+    "fitted": ("score", *FIT),
+    "fitted_kin": ("score", *FIT, "unlike"),
+    "fitted_few": ("score", *FIT),  # where few circles are surely caps
     "seen_kin": ("score", "unlike"),
 }
+MODELS = ALONE | {name + BESIDE: (*names, "learned") for name, names in ALONE.items()}
 
 
-def features(circles: Circles, unlike: Floats, fits: Fits | None = None) -> Floats:
+def features(
+    circles: Circles, unlike: Floats, fits: Fits | None = None, learned: Floats | None = None
+) -> Floats:
     """Return the features (N, F) in the order of `NAMES`; NaN where they are not known.
 
     Logit of the score; log of the misfit over the median in view, since what fits how well depends
     on the sensor; log of the sigma of the tilt, rad; height over radius, up to `ROUND`; how far the
     fit moves the circle, in its radii; log of how much larger or smaller it makes it; how far the
-    axis leans off the upright, rad; how unlike the sure caps it is (`cap_kin`).
+    axis leans off the upright, rad; how unlike the sure caps it is (`cap_kin`); logit of how far it
+    is a circle of the network.
     """
-    score = np.clip(circles.score, 1e-4, 1 - 1e-4)
     table = np.full((len(circles), len(NAMES)), np.nan)
-    table[:, 0], table[:, -1] = np.log(score / (1 - score)), unlike
+    table[:, 0], table[:, -2] = _logit(circles.score, 1e-4), unlike
+    if learned is not None:
+        table[:, -1] = _logit(learned, LEAST_SEEN)
     if fits is not None and fits.valid.any():
-        table[fits.valid, 1:-1] = _of_fits(circles, fits)[fits.valid]
+        table[fits.valid, 1:-2] = _of_fits(circles, fits)[fits.valid]
     return table
+
+
+def _logit(chance: Floats, least: float) -> Floats:
+    clipped = np.clip(chance, least, 1 - least)
+    return np.asarray(np.log(clipped / (1 - clipped)))
 
 
 def _of_fits(circles: Circles, fits: Fits) -> Floats:
@@ -67,20 +80,25 @@ def _of_fits(circles: Circles, fits: Fits) -> Floats:
     )
 
 
-def flat(fits: Fits, score: Floats, unlike: Floats) -> Bools:
+def flat(fits: Fits, score: Floats, unlike: Floats, learned: Floats | None = None) -> Bools:
     """Return which fits (N,) are as flat as hardly a cap, and not plainly a cap all the same.
 
     Args:
         fits: False where nothing was fitted.
         score: (N,) of `phase-hough`.
         unlike: (N,) as in `chances`.
+        learned: (N,) as in `chances`.
     """
     low = fits.valid & (fits.height < FLAT * fits.radius)
     plain = (unlike < ALIKE) & (score > PLAIN) & (fits.edges >= EDGED)
+    if learned is not None:
+        plain |= (unlike < KINDRED) & (learned > SEEN)
     return np.asarray(low & ~plain)
 
 
-def chances(circles: Circles, unlike: Floats, fits: Fits | None = None) -> Floats:
+def chances(
+    circles: Circles, unlike: Floats, fits: Fits | None = None, learned: Floats | None = None
+) -> Floats:
     """Return the probability (N,) of each circle to be a cap.
 
     It is what the fit tells, or the score where nothing was fitted; less where the circle looks
@@ -92,18 +110,20 @@ def chances(circles: Circles, unlike: Floats, fits: Fits | None = None) -> Float
         circles: As detected, with the scores of `phase-hough`.
         unlike: (N,) how unlike the sure caps they are, NaN where that is not known.
         fits: Of these circles, if there is depth.
+        learned: (N,) how far each is a circle of a network (`phase_learned.agreement`), if there is
+            one: it has models of its own.
     """
-    table = np.nan_to_num(features(circles, unlike, fits))
-    model = {name: probability(table, weights) for name, weights in _models().items()}
-    chance, beside = circles.score, model["seen_kin"]
+    table = np.nan_to_num(features(circles, unlike, fits, learned))
+    beside = "" if learned is None else BESIDE
+    model = {name: probability(table, _models()[name + beside]) for name in ALONE}
+    chance, alike = circles.score, model["seen_kin"]
     if fits is not None:
         fitted = np.where(np.isfinite(unlike), model["fitted"], model["fitted_few"])
         chance = np.where(fits.valid, fitted, chance)
-        chance = np.where(
-            flat(fits, circles.score, unlike), np.minimum(chance, FLAT_CHANCE), chance
-        )
-        beside = np.where(fits.valid, model["fitted_kin"], beside)
-    return np.where(np.isfinite(unlike), np.minimum(chance, beside), chance)
+        low = flat(fits, circles.score, unlike, learned)
+        chance = np.where(low, np.minimum(chance, FLAT_CHANCE), chance)
+        alike = np.where(fits.valid, model["fitted_kin"], alike)
+    return np.where(np.isfinite(unlike), np.minimum(chance, alike), chance)
 
 
 @lru_cache(maxsize=1)

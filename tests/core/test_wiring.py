@@ -315,6 +315,24 @@ def test_an_optional_input_may_have_no_producer(lab: Lab):
     assert found["b"] == {"frame": Link("source", 0), "mask": Link("a", 0)}
 
 
+def test_an_optional_input_does_not_take_what_another_of_its_type_takes(lab: Lab):
+    def second(self, before: Circles | None, circles: Circles) -> Circles:
+        return circles
+
+    def needy(self, circles: Circles, before: Circles | None = None) -> Circles:
+        return circles
+
+    text = lab.chain("both", "measure", declared(second))
+    assert links(lab, text)["c"] == {"circles": Link("b", 0)}
+    for name, link in (("a", Link("a", 1)), ("b", Link("b", 0))):
+        asked = text.replace("own-c}", f"own-c, inputs: {{before: {name}}}}}")
+        assert links(lab, asked)["c"] == {"circles": Link("b", 0), "before": link}
+    stage = declared(needy)
+    stage.required_inputs = lambda self: frozenset({"before"})  # type: ignore[method-assign]
+    found = links(lab, lab.chain("both", stage))
+    assert found["b"] == {"circles": Link("a", 1), "before": Link("a", 1)}
+
+
 def test_an_optional_input_without_producer_is_its_default_or_none(lab: Lab):
     unknown = Poses.unknown(2)
     seen: list[Any] = []

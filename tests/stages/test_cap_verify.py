@@ -67,10 +67,18 @@ def test_a_lid_is_no_cap_however_sure_the_detector_is_and_a_flat_cap_is_one() ->
 
 
 @pytest.mark.parametrize(
-    ("score", "brightness", "stays"), [(0.95, 0.8, True), (0.55, 0.8, False), (0.95, 0.3, False)]
+    ("score", "brightness", "learned", "stays"),
+    [
+        (0.95, 0.8, None, True),
+        (0.55, 0.8, None, False),
+        (0.95, 0.3, None, False),
+        (0.55, 0.8, 0.9, True),
+        (0.55, 0.8, 0.5, False),
+        (0.55, 0.3, 0.9, False),
+    ],
 )
 def test_an_old_flat_cap_stays_where_it_looks_like_the_others_and_is_plain(
-    score: float, brightness: float, stays: bool
+    score: float, brightness: float, learned: float | None, stays: bool
 ) -> None:
     places = [(x, y, 0.4) for y in (-0.035, 0.035) for x in (-0.09, -0.03, 0.03, 0.09)]
     caps = [cap(10, 40 * k, place, 0.017, 0.6) for k, place in enumerate(places[:7])]
@@ -82,8 +90,32 @@ def test_an_old_flat_cap_stays_where_it_looks_like_the_others_and_is_plain(
     gray[inside] = brightness
     depth += np.random.default_rng(1).normal(0, 0.0008, depth.shape)
     circles = Circles(circles.center, circles.radius, [*np.full(7, 0.95), score])
-    _, _, found = CapFit(up="camera", min_score=0.5).process(frame_from(depth, gray), circles)
+    seen = None
+    if learned is not None:
+        seen = Circles(circles.center, circles.radius, [*np.full(7, 0.95), learned])
+    frame = frame_from(depth, gray)
+    _, _, found = CapFit(up="camera", min_score=0.5).process(frame, circles, seen)
     assert len(found) == 7 + stays
+
+
+def test_the_surer_a_network_is_the_likelier_is_a_cap_and_what_it_does_not_see_is_less() -> None:
+    depth, gray, circles = scene()
+    frame = frame_from(depth, gray)
+    blind = RgbdFrame(frame.header, frame.color, None, 1.0, CAMERA)
+    stage, alike = CapFit(up="camera", min_score=0.0), np.zeros(6)
+    fits = stage.fit(frame.gray, frame.depth_m, CAMERA, circles)
+    for some in (fits, None):
+        chance = [chances(circles, alike, some, np.full(6, seen)) for seen in (0, 0.1, 0.5, 0.9)]
+        assert (np.diff(chance, axis=0) >= 0).all()
+        assert (chance[0] < chance[-1]).any()
+    beside = Circles(circles.center[:1], circles.radius[:1], [0.9])
+    for image in (frame, blind):
+        few, none = (
+            stage.process(image, circles, seen)[2].score
+            for seen in (beside, beside.take(np.array([], int)))
+        )
+        assert few[1:] == pytest.approx(none[1:])
+        assert few[0] > none[0] or image is blind
 
 
 def test_without_a_least_score_nothing_is_left_out_and_scores_stay() -> None:
@@ -118,8 +150,8 @@ def test_features_of_what_was_not_fitted_are_unknown_and_its_score_stays() -> No
     table = features(circles, UNKNOWN, fits)
     assert table.shape == (6, len(NAMES))
     assert np.isnan(table[~fits.valid, 1:]).all()
-    assert np.isfinite(table[fits.valid, :-1]).all()
-    assert np.isnan(table[:, -1]).all()
+    assert np.isfinite(table[fits.valid, :-2]).all()
+    assert np.isnan(table[:, -2:]).all()
     assert np.array_equal(chances(circles, UNKNOWN, fits)[~fits.valid], circles.score[~fits.valid])
     assert np.array_equal(chances(circles, UNKNOWN), circles.score)
 

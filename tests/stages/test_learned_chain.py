@@ -33,7 +33,7 @@ def test_more_brown_caps_among_rubble_are_found_than_by_the_net_alone_and_refitt
         mask, coarse = CapNet(radius_px=RADII).process(frame)
         _, learned = CapNet(radius_px=RADII, min_score=0.05).process(frame)
         circles = detect.process(frame, mask, learned)
-        _, _, circles = CapFit(min_score=0.5).process(frame, circles)
+        _, _, circles = CapFit(min_score=0.5).process(frame, circles, learned)
         alone.add(coarse, truth, counted(truth, *RADII))
         both.add(circles, truth, counted(truth, *RADII))
     assert both.f > max(0.9, alone.f)
@@ -53,8 +53,9 @@ def test_caps_near_the_camera_are_found_where_the_largest_radius_is_left_open(de
             near = {"distance": 0.25, "size_mm": (45, 75), "count": 12, "cap_color": color}
             frame = simulated(seed, width=640, height=480, shape_family="b", **near)
             seen = frame if depth else replace(frame, depth=None)
-            circles = detect.process(seen, *stage.process(seen))
-            _, _, circles = CapFit(min_score=0.5).process(seen, circles)
+            mask, learned = stage.process(seen)
+            circles = detect.process(seen, mask, learned)
+            _, _, circles = CapFit(min_score=0.5).process(seen, circles, learned)
             truth = frame.attached[TRUTH_TOPIC]
             score.add(circles, truth, counted(truth, 60, 200))
         found[name] = score
@@ -117,7 +118,8 @@ def test_one_cap_among_clutter_is_found_with_depth_and_hardly_a_cup_is_fitted() 
     fit, score = CapFit(min_score=0.5), Score()
     for seed in range(81, 93):
         frame = simulated(seed, width=640, height=480, shape_family="b", **BARE)
-        circles = fit.process(frame, detect.process(frame, *net.process(frame)))[-1]
+        mask, learned = net.process(frame)
+        circles = fit.process(frame, detect.process(frame, mask, learned), learned)[-1]
         truth = frame.attached[TRUTH_TOPIC]
         score.add(circles, truth, counted(truth, *RADII))
     assert score.right >= 10

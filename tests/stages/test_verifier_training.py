@@ -9,7 +9,7 @@ import pytest
 
 from mushpipe import Circles
 from mushpipe.core.truth import INSTANCES_TOPIC, TRUTH_TOPIC, Ignore
-from mushpipe.stages.cap_verify import MODELS, NAMES
+from mushpipe.stages.cap_verify import BESIDE, MODELS, NAMES
 from mushpipe.stages.verifier_net import LIMIT, WIDTHS, probability, read_models, write_models
 from tests.stages.frames import simulated
 from training.fitted import labels, teaches
@@ -43,9 +43,12 @@ def test_a_circle_teaches_the_models_that_would_be_asked_about_it() -> None:
     }
     rows = np.zeros((len(known), len(NAMES)))
     for row, (fitted, alike) in zip(rows, known, strict=True):
-        row[1:-1], row[-1] = 0.0 if fitted else np.nan, 0.0 if alike else np.nan
-    for model in MODELS:
-        assert teaches(rows, model).tolist() == [model in models for models in known.values()]
+        row[1:-2], row[-2] = 0.0 if fitted else np.nan, 0.0 if alike else np.nan
+    for beside in (False, True):
+        rows[:, -1] = 0.0 if beside else np.nan
+        for model in MODELS:
+            asked = [[name + beside * BESIDE for name in models] for models in known.values()]
+            assert teaches(rows, model).tolist() == [model in models for models in asked]
 
 
 def test_a_cap_teaches_one_circle_and_what_need_not_be_found_teaches_none() -> None:

@@ -65,7 +65,7 @@ def simulated(models: list[Path], cases: Iterator[Case], peers: bool) -> str:
                 frame = case.frame if stage.use_depth else replace(case.frame, depth=None)
                 ready = (frame, *NET.process(frame)) if stage.use_learned else flat
                 circles = stage.process(*ready)
-                circles = judge.kept(frame, circles) if name in FITTED else circles
+                circles = judge.kept(frame, circles, ready[2]) if name in FITTED else circles
                 scores[case.condition, name].add(circles, case.truth, counts)
     return judge.table(scores, [*nets, *((*CLASSIC, *FITTED) if peers else ())])
 
@@ -75,7 +75,8 @@ def both(frame: RgbdFrame, depth: bool, beside_depth: float = 0.8) -> Circles:
     net = CapNet(radius_px=OPEN, min_score=0.05, beside_depth=beside_depth)
     frame = frame if depth else replace(frame, depth=None)
     stage = PhaseHough(radius_px=OPEN, min_score=judge.LEAST, use_learned=True)
-    return judge.kept(frame, stage.process(frame, *net.process(frame)))
+    mask, learned = net.process(frame)
+    return judge.kept(frame, stage.process(frame, mask, learned), learned)
 
 
 def real(model: Path, folder: Path) -> Iterator[str]:
