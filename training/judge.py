@@ -26,7 +26,7 @@ from training.verifier import RADII, segmentations
 PAPER = (8.0, 38.0)  # px
 BEDS = ("even", "gradient", "dense", "brown", "tilted")
 BINS = 5  # of the score, for `reliability`
-LEAST = 0.2  # score of what `cap-fit` decides about, as in the graphs
+LEAST = 0.1  # score of what `cap-fit` decides about, as in the graphs
 
 
 class Detector(Protocol):

@@ -12,7 +12,7 @@ from pydantic import Field, PrivateAttr, model_validator
 from mushpipe import Circles, Mask, RgbdFrame, Stage, UsageError
 from mushpipe.core.arrays import Bools, Bytes, Floats, Ints32, Singles
 from mushpipe.core.paths import GraphPath
-from mushpipe.stages.discs import LIKELY, Radii, certain_first, many_likely
+from mushpipe.stages.discs import LIKELY, Radii, discs_of, many_likely
 from mushpipe.stages.doubling import doubled
 from mushpipe.stages.phase_blobs import blobs_of
 from mushpipe.stages.phase_decide import decide
@@ -50,6 +50,7 @@ _EVERY = 2  # edge points; of so many one votes where network and depth bring ca
 # are as many as the caps that it doubts, and look like these to the verifier.
 _SEEN, _SEEN_OF_FEW = 0.1, 0.35
 _SURE = 0.8  # of a network's circle, from which on it is taken for a cap though it has no outline
+_BARE = 0.4  # of such a one where there is depth: it may be a stump, and `cap-fit` can tell
 _LARGE = 80.0  # px; radius up to which caps are looked for in any case where [8, null] is set
 _SMALLEST = 12  # px; images smaller than this in either direction hold no circle
 
@@ -171,13 +172,17 @@ class PhaseHough(Stage):
         circles = Circles(shapes[:, :2], equal_area_radius(shapes), score)
         if found.learned is None:
             return circles
-        if found.relief.known:
-            unseen = found.table[order, AT_LEARNED] == 0
-            self._contradiction.look(frame.header.sequence, circles, unseen, found.learned)
-            return certain_first(without_clods(frame.color, circles, unseen))
         sure = found.learned.take(found.learned.score >= max(_SURE, self.min_score))
+        if found.relief.known:
+            sure = Circles(sure.center, sure.radius, np.minimum(sure.score, _BARE))
+            sure = sure.take(sure.score >= self.min_score)
         radius = equal_area_radius(found.shapes)
-        return with_bare(circles, sure, found.shapes, radius, order[score >= LIKELY])
+        circles = with_bare(circles, sure, found.shapes, radius, order[score >= LIKELY])
+        if not found.relief.known:
+            return circles
+        seen = agreement(discs_of(circles), np.array(circles.radius), found.learned)
+        self._contradiction.look(frame.header.sequence, circles, seen == 0, found.learned)
+        return without_clods(frame.color, circles, seen)
 
     def gather(
         self, frame: RgbdFrame, mask: Mask, learned: Circles | None = None
@@ -271,7 +276,7 @@ class PhaseHough(Stage):
             frame = example_frame(native=native)
             mask = Mask(frame.depth_m < 0.49)
             self.process(frame, mask, example_circles())
-        without_clods(frame.color, example_circles(), np.ones(1, np.bool_))
+        without_clods(frame.color, example_circles(), np.zeros(1))
         self.process(replace(frame, depth=None), mask, example_circles())
 
 

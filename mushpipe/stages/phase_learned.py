@@ -18,6 +18,7 @@ _SAME = 0.5  # IoU from which on an outline is that of a circle
 _SOIL = 100.0  # gray level; brighter ground holds no clods
 _GROUND = 1.5  # distance of tones up to which an unseen circle looks like the soil around it
 _EXACTLY = 0.5  # and up to which any does; of 2695 caps of simulated frames on soil one did
+_DOUBTED = 0.9  # of `seen`
 _UNEVEN = 0.12  # spread of the brightness of soil over its mean
 _OWN = 0.5  # share of a circle that none that was accepted may cover
 
@@ -55,7 +56,7 @@ def agreement(shapes: Floats, radius: Floats, learned: Circles) -> Floats:
     return _agreement(shapes, radius, learned.center, learned.radius, learned.score)
 
 
-def without_clods(color: Bytes, circles: Circles, unseen: Bools) -> Circles:
+def without_clods(color: Bytes, circles: Circles, seen: Floats) -> Circles:
     """Return the circles but for those that look like the dark soil they lie on.
 
     A round clod has the form of a cap in depth as well, and looks just like the soil, as no cap
@@ -66,7 +67,7 @@ def without_clods(color: Bytes, circles: Circles, unseen: Bools) -> Circles:
     Args:
         color: (H, W, 3) RGB.
         circles: Those accepted.
-        unseen: (N,) on which of them no circle of the network lies.
+        seen: (N,) how far each is a circle of the network, as from `agreement`.
     """
     corner = np.array([color.shape[1] - 1, color.shape[0] - 1])
     room = np.minimum(circles.center, corner - circles.center)
@@ -74,7 +75,8 @@ def without_clods(color: Bytes, circles: Circles, unseen: Bools) -> Circles:
     # a tone that is within reach of that of soil is no brighter than this
     ground = ground_of(color, circles, whole & darker(tones - _GROUND, _SOIL))
     away = off_ground(tones, ground)
-    clod = (away < _EXACTLY) | (unseen & (away < _GROUND) & (ground[:, 3] >= _UNEVEN))
+    exactly = (away < _EXACTLY) & (seen < _DOUBTED)
+    clod = exactly | ((seen == 0) & (away < _GROUND) & (ground[:, 3] >= _UNEVEN))
     return circles.take(~(clod & darker(ground, _SOIL)))
 
 

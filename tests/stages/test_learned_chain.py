@@ -26,7 +26,7 @@ BARE = {"scene": "lab", "count": 1, "clutter": 12}
 def test_more_brown_caps_among_rubble_are_found_than_by_the_net_alone_and_refitted() -> None:
     settings = {"cap_color": "brown", "soil": 3.0, "rubble": 50, "relief_mm": 3.0, "count": 40}
     alone, both = Score(), Score()
-    detect = PhaseHough(radius_px=RADII, min_score=0.2, use_learned=True)
+    detect = PhaseHough(radius_px=RADII, min_score=0.1, use_learned=True)
     for seed in range(77, 85):
         frame = simulated(seed, width=640, height=480, shape_family="b", **settings)
         truth = frame.attached[TRUTH_TOPIC]
@@ -46,7 +46,7 @@ def test_more_brown_caps_among_rubble_are_found_than_by_the_net_alone_and_refitt
 def test_caps_near_the_camera_are_found_where_the_largest_radius_is_left_open(depth: bool) -> None:
     found = {}
     for name, net, detector in (("fixed", 60, 80), ("open", None, None)):
-        detect = PhaseHough(radius_px=(8, detector), min_score=0.2, use_learned=True)
+        detect = PhaseHough(radius_px=(8, detector), min_score=0.1, use_learned=True)
         stage = CapNet(radius_px=(8, net), min_score=0.05, beside_depth=0.8)
         score = Score()
         for seed, color in ((91, "brown"), (92, "white"), (93, "brown")):
@@ -114,7 +114,7 @@ def test_one_cap_among_clutter_is_found_without_depth_and_hardly_a_cup_with_it()
 
 def test_one_cap_among_clutter_is_found_with_depth_and_hardly_a_cup_is_fitted() -> None:
     net = CapNet(radius_px=(8, None), min_score=0.05, beside_depth=0.8)
-    detect = PhaseHough(radius_px=(8, None), min_score=0.2, use_learned=True)
+    detect = PhaseHough(radius_px=(8, None), min_score=0.1, use_learned=True)
     fit, score = CapFit(min_score=0.5), Score()
     for seed in range(81, 93):
         frame = simulated(seed, width=640, height=480, shape_family="b", **BARE)

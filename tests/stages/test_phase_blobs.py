@@ -101,7 +101,7 @@ def test_dim_wood_on_wood_is_found_where_it_stands() -> None:
     fit = CapFit(depth_bias_mm=2.85, min_score=0.5)
     on_cap = {}
     for blobs in (False, True):
-        detector = PhaseHough(radius_px=(8, None), min_score=0.2, use_learned=True, use_blobs=blobs)
+        detector = PhaseHough(radius_px=(8, None), min_score=0.1, use_learned=True, use_blobs=blobs)
         circles = fit.process(frame, detector.process(frame, mask, learned), learned)[2]
         inside = (circles.center[:, None] >= boxes[:, :2]) & (
             circles.center[:, None] <= boxes[:, :2] + boxes[:, 2:]

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from mushpipe import Circles, Mask, UsageError
-from mushpipe.stages.discs import Radii
+from mushpipe.stages.cap_fit import CapFit
+from mushpipe.stages.discs import LIKELY, Radii
 from mushpipe.stages.phase_hough import PhaseHough
 from mushpipe.stages.phase_learned import (
     add_discs,
@@ -142,6 +143,21 @@ def test_a_sure_circle_without_an_outline_is_a_cap_and_one_that_is_not_sure_is_n
     assert len(small.process(frame, mask, circles(dim))) == 0
 
 
+def test_with_depth_a_sure_circle_without_an_outline_is_for_the_fit_to_decide() -> None:
+    depth, gray = draw([cap(5, 40, (-0.05, 0, 0.4), 0.02, 0.55)], 0.44)
+    frame, mask = frame_from(depth, gray), Mask(depth < 0.435)
+    (white,) = PhaseHough().process(frame, mask).center.tolist()
+    nothing = (240.0, 120.0, 20.0, 0.95)  # flat, and as its surroundings
+    learned = circles((*white, 30, 0.9), nothing)
+    only = PhaseHough(use_learned=True).process(frame, mask, learned).center
+    assert only == pytest.approx(np.array([white]), abs=0.1)
+    found = PhaseHough(use_learned=True, min_score=0.1).process(frame, mask, learned)
+    assert found.center[-1].tolist() == [240, 120]
+    assert found.score[-1] < LIKELY < found.score[0]
+    fit = CapFit(up="camera", min_score=0.5)
+    assert fit.process(frame, found, learned)[2].center == pytest.approx(np.array([white]), abs=1)
+
+
 def test_circles_without_an_outline_come_from_nowhere_but_free_ground() -> None:
     shapes = np.array([[50, 50, 20, 0, 0], [150, 50, 20, 0, 0]], float)
     rows = [(50, 58, 20, 0.9), (50, 76, 12, 0.9), (50, 62, 8, 0.9), (150, 62, 8, 0.9)]
@@ -170,16 +186,17 @@ def test_clods_look_like_dark_soil_and_nearly_so_where_the_network_sees_nothing(
             color[np.hypot(u - x, v - y) < 12] = tone
         return np.clip(light * color, 0, 255).astype(np.uint8)
 
-    def left(seen: list[int], color: np.ndarray) -> list[float]:
-        unseen = ~np.isin(np.arange(4), seen)
-        return without_clods(color, found, unseen).center[:, 0].tolist()
+    def left(rows: list[int], color: np.ndarray, by: float = 0.8) -> list[float]:
+        seen = np.where(np.isin(np.arange(4), rows), by, 0.0)
+        return without_clods(color, found, seen).center[:, 0].tolist()
 
     assert left([], scene(soil * grain)) == [40, 150]
     assert left([3], scene(soil * grain)) == [40, 150, 205]
     assert left([0, 1, 2, 3], scene(soil * grain)) == [40, 150, 205]
+    assert left([1], scene(soil * grain), 0.95) == [40, 90, 150]  # the network is sure of it
     assert left([], scene(soil)) == [40, 150, 205]  # even
     assert left([], scene(soil * grain, 0.2)) == [40, 90, 150, 205]  # night
     assert left([], scene(soil * grain, 2.5)) == [40, 90, 150, 205]  # as bright as mycelium
     cut = Circles(found.center - (80, 0), found.radius, found.score).take([1, 3])
     color = scene(soil * grain)[:, 80:]
-    assert without_clods(color, cut, np.ones(2, np.bool_)).center[:, 0].tolist() == [10]
+    assert without_clods(color, cut, np.zeros(2)).center[:, 0].tolist() == [10]

@@ -27,7 +27,7 @@ def caps(frame: RgbdFrame) -> int:
     """Return how many caps the stages of graphs/pick.yaml find."""
     net, detect = (
         CapNet(radius_px=(8, None), min_score=0.05),
-        PhaseHough(radius_px=(8, None), min_score=0.2, use_learned=True),
+        PhaseHough(radius_px=(8, None), min_score=0.1, use_learned=True),
     )
     circles = detect.process(frame, *net.process(frame))
     return len(CapFit(min_score=0.5).process(frame, circles)[2])
