@@ -10,7 +10,7 @@ ROOT = Path(__file__).parents[2]
 MAIN = [sys.executable, "-c", "from mushpipe.cli import main; main()"]
 GRAPH = """\
 mushpipe: 1
-source: {use: synthetic, max_frames: 3, count: 12}
+source: {use: synthetic, width: 320, height: 240, distance: 0.3, max_frames: 3, count: 12}
 stages:
   segment: {use: otsu}
   open:    {use: opening}

@@ -11,74 +11,77 @@ from mushpipe.core.errors import EXIT_USAGE
 from mushpipe.sinks.mcap import McapSink
 from mushpipe.sinks.rerun import RerunSink
 from tests.cli.shell import mushpipe
+from tests.io.values import make_frame, record, trace_of
 
 
-def test_a_recording_is_never_written_over_by_its_own_run(folder: Path) -> None:
-    mushpipe("record", "--source", "synthetic", "--frames", 1, "-o", "a.mcap", cwd=folder)
-    before = (folder / "a.mcap").read_bytes()
+@pytest.fixture
+def recorded(folder: Path) -> Path:
+    """The folder, with a recording of one frame, a.mcap, too."""
+    return record(folder / "a.mcap", [trace_of(make_frame())]).parent
+
+
+def test_a_recording_is_never_written_over_by_its_own_run(recorded: Path) -> None:
+    before = (recorded / "a.mcap").read_bytes()
     done = mushpipe(
-        *("run", "graph.yaml", "--source", "a.mcap", "--set", "log.path=./a.mcap"), cwd=folder
+        *("run", "graph.yaml", "--source", "a.mcap", "--set", "log.path=./a.mcap"), cwd=recorded
     )
     assert done.returncode == EXIT_USAGE
     assert "sink 'log' would write over what is read" in done.stderr
-    assert (folder / "a.mcap").read_bytes() == before
+    assert (recorded / "a.mcap").read_bytes() == before
 
 
-def test_a_run_writes_over_neither_its_graph_nor_its_plugins(folder: Path) -> None:
-    mushpipe("record", "--source", "synthetic", "--frames", 1, "-o", "a.mcap", cwd=folder)
-    (folder / "mine.py").write_text(
+def test_a_run_writes_over_neither_its_graph_nor_its_plugins(recorded: Path) -> None:
+    (recorded / "mine.py").write_text(
         "from mushpipe import Mask, RgbdFrame, Stage\n"
         "class Everything(Stage):\n"
         "    def process(self, frame: RgbdFrame) -> Mask:\n"
         "        return Mask(frame.gray >= 0)\n"
     )
-    (folder / "own.yaml").write_text(
+    (recorded / "own.yaml").write_text(
         "mushpipe: 1\nsource: {use: mcap, path: a.mcap}\n"
         "stages: {all: {use: ./mine.py:Everything}}\n"
         "sinks: {log: {use: mcap, path: out.mcap}}\n"
     )
-    before = {path: path.read_bytes() for path in folder.iterdir()}
+    before = {path: path.read_bytes() for path in recorded.iterdir()}
     for name in ("own.yaml", "mine.py", "a.mcap"):
         for option in (("--set", f"log.path=./{name}"), ("--manifest", name)):
-            done = mushpipe("run", "own.yaml", *option, cwd=folder)
+            done = mushpipe("run", "own.yaml", *option, cwd=recorded)
             assert done.returncode == EXIT_USAGE
             assert name in done.stderr
-        done = mushpipe("bench", "own.yaml", "--frames", 10, "--json", name, cwd=folder)
+        done = mushpipe("bench", "own.yaml", "--frames", 10, "--json", name, cwd=recorded)
         assert done.returncode == EXIT_USAGE
     assert {path: path.read_bytes() for path in before} == before
-    done = mushpipe("run", "own.yaml", "--manifest", "out.mcap", cwd=folder)
+    done = mushpipe("run", "own.yaml", "--manifest", "out.mcap", cwd=recorded)
     assert done.returncode == EXIT_USAGE
-    assert (folder / "out.mcap").read_bytes()[:5] == b"\x89MCAP"
+    assert (recorded / "out.mcap").read_bytes()[:5] == b"\x89MCAP"
 
 
-def test_two_sinks_never_write_one_file(folder: Path) -> None:
-    text = (folder / "graph.yaml").read_text()
-    (folder / "graph.yaml").write_text(text + "  again: {use: mcap, path: ./out.mcap}\n")
-    mushpipe("record", "--source", "synthetic", "--frames", 1, "-o", "a.mcap", cwd=folder)
+def test_two_sinks_never_write_one_file(recorded: Path) -> None:
+    text = (recorded / "graph.yaml").read_text()
+    (recorded / "graph.yaml").write_text(text + "  again: {use: mcap, path: ./out.mcap}\n")
     done = mushpipe(
-        *("run", "graph.yaml", "--source", "a.mcap", "--set", "log.path=./out.mcap"), cwd=folder
+        *("run", "graph.yaml", "--source", "a.mcap", "--set", "log.path=./out.mcap"), cwd=recorded
     )
     assert done.returncode == EXIT_USAGE
     assert "sink 'again' would write over the file of sink 'log', " in done.stderr
 
 
-def test_no_command_writes_over_what_it_reads(folder: Path) -> None:
-    mushpipe("record", "--source", "synthetic", "--frames", 1, "-o", "a.mcap", cwd=folder)
-    (folder / "b.mcap").hardlink_to(folder / "a.mcap")
-    before = (folder / "a.mcap").read_bytes()
+def test_no_command_writes_over_what_it_reads(recorded: Path) -> None:
+    (recorded / "b.mcap").hardlink_to(recorded / "a.mcap")
+    before = (recorded / "a.mcap").read_bytes()
     for arguments in (
         ("view", "a.mcap", "--save", "b.mcap"),
         ("calibrate", "depth", "a.mcap", "--plane", "0.5", "-o", "b.mcap"),
         ("run", "graph.yaml", "--source", "a.mcap", "--manifest", "b.mcap"),
     ):
-        done = mushpipe(*arguments, cwd=folder)
+        done = mushpipe(*arguments, cwd=recorded)
         assert done.returncode == EXIT_USAGE, done.stderr
         assert "b.mcap is what is read, and would be written over" in done.stderr
-        assert (folder / "a.mcap").read_bytes() == before
+        assert (recorded / "a.mcap").read_bytes() == before
 
 
-def test_a_sink_of_ones_own_is_kept_from_its_source_by_the_type_of_its_path(folder: Path) -> None:
-    (folder / "mine.py").write_text(
+def test_a_sink_of_ones_own_is_kept_from_its_source_by_the_type_of_its_path(recorded: Path) -> None:
+    (recorded / "mine.py").write_text(
         "from mushpipe import Circles, RunInfo, Sink, SinkPath\n\n"
         "class Lines(Sink):\n"
         "    path: SinkPath | None = None\n"
@@ -87,15 +90,14 @@ def test_a_sink_of_ones_own_is_kept_from_its_source_by_the_type_of_its_path(fold
         "    def consume(self, circles: Circles) -> None:\n"
         "        pass\n"
     )
-    text = (folder / "graph.yaml").read_text()
+    text = (recorded / "graph.yaml").read_text()
     own = "  mine: {use: ./mine.py:Lines, path: ./a.mcap}\n"
-    (folder / "graph.yaml").write_text(text + own)
-    mushpipe("record", "--source", "synthetic", "--frames", 1, "-o", "a.mcap", cwd=folder)
-    before = (folder / "a.mcap").read_bytes()
-    done = mushpipe("run", "graph.yaml", "--source", "a.mcap", cwd=folder)
+    (recorded / "graph.yaml").write_text(text + own)
+    before = (recorded / "a.mcap").read_bytes()
+    done = mushpipe("run", "graph.yaml", "--source", "a.mcap", cwd=recorded)
     assert done.returncode == EXIT_USAGE
     assert "sink 'mine' would write over what is read" in done.stderr
-    assert (folder / "a.mcap").read_bytes() == before
+    assert (recorded / "a.mcap").read_bytes() == before
 
 
 @pytest.mark.parametrize(
@@ -107,15 +109,14 @@ def test_a_sink_of_ones_own_is_kept_from_its_source_by_the_type_of_its_path(fold
     ],
 )
 def test_nothing_is_emptied_where_there_is_nothing_to_play(
-    folder: Path, options: tuple[object, ...], message: str
+    recorded: Path, options: tuple[object, ...], message: str
 ) -> None:
-    mushpipe("record", "--source", "synthetic", "--frames", 1, "-o", "a.mcap", cwd=folder)
-    (folder / "out").mkdir()
-    (folder / "out/a.mcap").write_bytes(b"of a run before")
-    done = mushpipe("run", "graph.yaml", "--source", "a.mcap", *options, cwd=folder)
+    (recorded / "out").mkdir()
+    (recorded / "out/a.mcap").write_bytes(b"of a run before")
+    done = mushpipe("run", "graph.yaml", "--source", "a.mcap", *options, cwd=recorded)
     assert done.returncode != 0
     assert message in done.stderr
-    assert (folder / "out/a.mcap").read_bytes() == b"of a run before"
+    assert (recorded / "out/a.mcap").read_bytes() == b"of a run before"
 
 
 @pytest.mark.parametrize("held", ["out.mcap", "out.rrd"])
