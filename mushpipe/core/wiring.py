@@ -1,7 +1,7 @@
 """Who feeds whom: an input takes the nearest producer of its type above it in the file.
 
-An optional input does not take what another one of the same plugin takes already, unless the graph
-or a setting asks for it: a second look at the same is no news.
+An optional input beside another one of its type is left open, unless the graph or a setting asks
+for it: the nearest goes to the other, and which of those farther up is meant cannot be known.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def wire(document: Document, registry: Registry, nodes: list[Node]) -> list[Prob
             at = (*_place(node), "inputs", name)
             hint = suggest(name, [port.name for port in node.ports.inputs])
             problems.append(document.problem(at, f"'{node.use}' has no input '{name}'", hint, True))
-        for port in sorted(node.ports.inputs, key=lambda port: not port.required):
+        for port in node.ports.inputs:
             if port.type is Trace and node.kind == "sink":
                 if port.name in node.asked:
                     at = (*_place(node), "inputs", port.name)
@@ -56,7 +56,7 @@ def _connect(
 ) -> Problem | None:
     wanted = node.asked.get(port.name)
     link = _nearest(port, wanted, above)
-    if link and (wanted or port.required or link not in node.links.values()):
+    if link and (wanted or not _is_second(port, node)):
         node.links[port.name] = link
         return None
     at = _place(node)
@@ -75,6 +75,15 @@ def _connect(
     message = f"nothing above '{node.name}' produces the {port.type.__name__} of its '{port.name}'"
     hint = _namesake(port, above) or _who_produces(registry, port)
     return document.problem(at, message, hint, key=True)
+
+
+def _is_second(port: Port, node: Node) -> bool:
+    """Whether an input is optional, and the nearest of its type goes to another one."""
+    if port.required:
+        return False
+    alike = [other for other in node.ports.inputs if other.type is port.type]
+    named = [other for other in alike if other.required or other.name in node.asked]
+    return port is not (named or alike)[0]
 
 
 def _nearest(port: Port, wanted: str | None, above: list[Node]) -> Link | None:
@@ -181,5 +190,5 @@ def _warn_mixed(document: Document, nodes: list[Node]) -> None:
 def _source_of(node: Node, kind: type) -> str | None:
     """Return the producer of an input of a type."""
     ports = [port.name for port in node.ports.inputs if port.type is kind]
-    link = node.links.get(ports[0]) if ports else None
-    return link.producer if link else None
+    links = [node.links[name] for name in ports if name in node.links]
+    return links[0].producer if links else None

@@ -73,9 +73,9 @@ class CapFit(Stage):
         None,
         ge=0,
         le=1,
-        description="renew the scores of phase-hough by what the fits tell and by how like the "
-        "sure caps circles look, and leave out those below this one; null keeps all, with their "
-        "scores",
+        description="renew the scores of phase-hough by what the fits tell, by how like the sure "
+        "caps circles look and by those of cap-net, if they are an input, and leave out those "
+        "below this one; null keeps all, with their scores",
     )
 
     _edges: EdgeWatch = PrivateAttr(default_factory=EdgeWatch)

@@ -23,11 +23,11 @@ ROUND = 0.6  # height over radius; a rounder cap is no more, and no less, likely
 # like others, the detector is sure of them, and depth shows their edge. It is a rule because a
 # regression over standardised features gives rare ones little weight.
 FLAT = 0.15  # height over radius,
-ALIKE, PLAIN = 1.0, 0.6  # unless it is less unlike the sure caps, has a higher score,
-EDGED = 5  # and an edge in so many of 32 directions;
+EDGED = 5  # unless it has an edge in so many of 32 directions,
+ALIKE, PLAIN = 1.0, 0.6  # and is less unlike the sure caps and has a higher score,
 KINDRED, SEEN = 0.2, 0.7  # or is just like them, and a network sees it so plainly
 FLAT_CHANCE = 0.01
-LEAST_SEEN = 0.005
+LEAST_SEEN, LEAST_CHANCE = 0.005, 1e-6  # logits have no end
 FIT = ("misfit", "tilt", "aspect", "moved", "resized", "lean")
 NAMES = ("score", *FIT, "unlike", "learned")
 BESIDE = "_learned"  # ends the name of a model beside a network
@@ -90,10 +90,10 @@ def flat(fits: Fits, score: Floats, unlike: Floats, learned: Floats | None = Non
         learned: (N,) as in `chances`.
     """
     low = fits.valid & (fits.height < FLAT * fits.radius)
-    plain = (unlike < ALIKE) & (score > PLAIN) & (fits.edges >= EDGED)
+    plain = (unlike < ALIKE) & (score > PLAIN)
     if learned is not None:
         plain |= (unlike < KINDRED) & (learned > SEEN)
-    return np.asarray(low & ~plain)
+    return np.asarray(low & ~(plain & (fits.edges >= EDGED)))
 
 
 def chances(
@@ -111,11 +111,11 @@ def chances(
         unlike: (N,) how unlike the sure caps they are, NaN where that is not known.
         fits: Of these circles, if there is depth.
         learned: (N,) how far each is a circle of a network (`phase_learned.agreement`), if there is
-            one: it has models of its own.
+            one: it has models of its own. What it speaks for counts, and what it speaks against
+            counts half: of real caps it is blind to more than of those that it was trained on.
     """
     table = np.nan_to_num(features(circles, unlike, fits, learned))
-    beside = "" if learned is None else BESIDE
-    model = {name: probability(table, _models()[name + beside]) for name in ALONE}
+    model = {name: _said(name, table, learned is not None) for name in ALONE}
     chance, alike = circles.score, model["seen_kin"]
     if fits is not None:
         fitted = np.where(np.isfinite(unlike), model["fitted"], model["fitted_few"])
@@ -124,6 +124,16 @@ def chances(
         chance = np.where(low, np.minimum(chance, FLAT_CHANCE), chance)
         alike = np.where(fits.valid, model["fitted_kin"], alike)
     return np.where(np.isfinite(unlike), np.minimum(chance, alike), chance)
+
+
+def _said(name: str, table: Floats, beside: bool) -> Floats:
+    """Return what a model says (N,) of features (N, F), or that and the one beside a network."""
+    alone = probability(table, _models()[name])
+    if not beside:
+        return alone
+    with_it = probability(table, _models()[name + BESIDE])
+    both = (_logit(alone, LEAST_CHANCE) + _logit(with_it, LEAST_CHANCE)) / 2
+    return np.maximum(with_it, 1 / (1 + np.exp(-both)))
 
 
 @lru_cache(maxsize=1)

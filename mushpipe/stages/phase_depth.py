@@ -121,6 +121,13 @@ class Relief(NamedTuple):
         """Return the size, m, of a pixel of the full image on the bed at x, y (px)."""
         return plane_depth(self.plane, (x - 0.5) / CELL, (y - 0.5) / CELL) / self.focal
 
+    def heights(self, discs: Floats) -> Floats:
+        """Return heights (N,) m at the centres of discs x, y, r (N, 3) px; NaN where unknown."""
+        bottom, right = (size - 1 for size in self.height.shape)
+        u, v = ((discs[:, :2] + 0.5) / CELL).astype(int).T
+        height = self.height[v.clip(0, bottom), u.clip(0, right)]
+        return np.where(height == -1, np.nan, height)
+
     def edges(self) -> Edges:
         """Return the depth discontinuities, in px of the height map."""
         known = np.maximum(self.filled, 0)

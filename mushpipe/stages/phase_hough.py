@@ -172,15 +172,12 @@ class PhaseHough(Stage):
         circles = Circles(shapes[:, :2], equal_area_radius(shapes), score)
         if found.learned is None:
             return circles
-        sure = found.learned.take(found.learned.score >= max(_SURE, self.min_score))
-        if found.relief.known:
-            sure = Circles(sure.center, sure.radius, np.minimum(sure.score, _BARE))
-            sure = sure.take(sure.score >= self.min_score)
         radius = equal_area_radius(found.shapes)
-        circles = with_bare(circles, sure, found.shapes, radius, order[score >= LIKELY])
-        if not found.relief.known:
+        bare = self._sure(found.learned, found.relief)
+        circles = with_bare(circles, bare, found.shapes, radius, order[score >= LIKELY])
+        if learned is None or not found.relief.known:
             return circles
-        seen = agreement(discs_of(circles), np.array(circles.radius), found.learned)
+        seen = agreement(discs_of(circles), np.array(circles.radius), learned)
         self._contradiction.look(frame.header.sequence, circles, seen == 0, found.learned)
         return without_clods(frame.color, circles, seen)
 
@@ -233,6 +230,16 @@ class PhaseHough(Stage):
         which = (np.isfinite(found.middle) + 2 * asked).astype(np.int32)
         parts = (found.edges, found.shapes, found.hits, found.table)
         return decide(*parts, which, self._load(), self.min_score, led)
+
+    def _sure(self, learned: Circles, relief: Relief) -> Circles:
+        """Return the circles of the network that may be caps though no outline is found of them."""
+        sure = learned.take(learned.score >= max(_SURE, self.min_score))
+        if not relief.known:
+            return sure
+        discs, score = discs_of(sure), np.minimum(sure.score, _BARE)
+        possible = self._plausible(discs, relief.heights(discs), relief)
+        kept = possible & (score >= self.min_score)
+        return Circles(sure.center, sure.radius, score).take(kept)
 
     def _load(self) -> Models:
         """Return the models, read once."""

@@ -17,8 +17,8 @@ _AROUND = 4.0  # px; a circle of a network is not more exact than that
 _SAME = 0.5  # IoU from which on an outline is that of a circle
 _SOIL = 100.0  # gray level; brighter ground holds no clods
 _GROUND = 1.5  # distance of tones up to which an unseen circle looks like the soil around it
-_EXACTLY = 0.5  # and up to which any does; of 2695 caps of simulated frames on soil one did
-_DOUBTED = 0.9  # of `seen`
+_EXACTLY = 0.5  # and up to which any does; of 2695 caps of simulated frames on soil one did,
+_DOUBTED = 0.9  # but for those that the network sees so plainly
 _UNEVEN = 0.12  # spread of the brightness of soil over its mean
 _OWN = 0.5  # share of a circle that none that was accepted may cover
 
@@ -61,8 +61,8 @@ def without_clods(color: Bytes, circles: Circles, seen: Floats) -> Circles:
 
     A round clod has the form of a cap in depth as well, and looks just like the soil, as no cap
     does. Caps that the network sees nothing of are few, and do not come near to it, unless it is
-    even. White caps on mycelium or a table do look like that, and where the border cuts a circle
-    too little of the ground is seen.
+    even, and what it is surest of is no clod. White caps on mycelium or a table do look like that,
+    and where the border cuts a circle too little of the ground is seen.
 
     Args:
         color: (H, W, 3) RGB.

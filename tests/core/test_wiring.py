@@ -315,19 +315,34 @@ def test_an_optional_input_may_have_no_producer(lab: Lab):
     assert found["b"] == {"frame": Link("source", 0), "mask": Link("a", 0)}
 
 
-def test_an_optional_input_does_not_take_what_another_of_its_type_takes(lab: Lab):
-    def second(self, before: Circles | None, circles: Circles) -> Circles:
-        return circles
+def before_circles(self, before: Circles | None, circles: Circles) -> Circles:
+    return circles
 
-    def needy(self, circles: Circles, before: Circles | None = None) -> Circles:
-        return circles
 
-    text = lab.chain("both", "measure", declared(second))
-    assert links(lab, text)["c"] == {"circles": Link("b", 0)}
-    for name, link in (("a", Link("a", 1)), ("b", Link("b", 0))):
-        asked = text.replace("own-c}", f"own-c, inputs: {{before: {name}}}}}")
-        assert links(lab, asked)["c"] == {"circles": Link("b", 0), "before": link}
-    stage = declared(needy)
+def two_circles(self, one: Circles | None, two: Circles | None) -> Circles: ...
+
+
+@pytest.mark.parametrize(
+    ("process", "asked", "found"),
+    [
+        (before_circles, {}, {"circles": "b"}),
+        (before_circles, {"before": "a"}, {"circles": "b", "before": "a"}),
+        (before_circles, {"before": "b"}, {"circles": "b", "before": "b"}),
+        (before_circles, {"circles": "a"}, {"circles": "a"}),
+        (two_circles, {}, {"one": "b"}),
+        (two_circles, {"two": "a"}, {"two": "a"}),
+    ],
+)
+def test_an_optional_input_beside_another_of_its_type_is_left_open_unless_asked_for(
+    lab: Lab, process: Any, asked: dict[str, str], found: dict[str, str]
+):
+    text = lab.chain("both", "measure", declared(process))
+    text = text.replace("own-c}", f"own-c, inputs: {asked}}}".replace("'", ""))
+    assert {name: link.producer for name, link in links(lab, text)["c"].items()} == found
+
+
+def test_a_setting_can_ask_for_an_optional_input_beside_another_of_its_type(lab: Lab):
+    stage = declared(before_circles)
     stage.required_inputs = lambda self: frozenset({"before"})  # type: ignore[method-assign]
     found = links(lab, lab.chain("both", stage))
     assert found["b"] == {"circles": Link("a", 1), "before": Link("a", 1)}

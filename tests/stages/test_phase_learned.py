@@ -158,6 +158,17 @@ def test_with_depth_a_sure_circle_without_an_outline_is_for_the_fit_to_decide() 
     assert fit.process(frame, found, learned)[2].center == pytest.approx(np.array([white]), abs=1)
 
 
+def test_with_depth_a_network_adds_no_circle_of_a_diameter_that_is_not_looked_for() -> None:
+    caps = [cap(5, 40, (-0.05, 0, 0.4), 0.02, 0.55), cap(5, 40, (0.05, 0, 0.4), 0.012, 0.55)]
+    depth, gray = draw(caps, 0.44)
+    frame, mask = frame_from(depth, gray), Mask(depth < 0.435)
+    found = PhaseHough(min_score=0.1).process(frame, mask)
+    learned = Circles(found.center, found.radius, np.full(2, 0.95))
+    small = PhaseHough(use_learned=True, min_score=0.1, diameter_mm=(6, 30))
+    only = small.process(frame, mask, learned)
+    assert only.radius == pytest.approx([found.radius.min()], abs=0.5)
+
+
 def test_circles_without_an_outline_come_from_nowhere_but_free_ground() -> None:
     shapes = np.array([[50, 50, 20, 0, 0], [150, 50, 20, 0, 0]], float)
     rows = [(50, 58, 20, 0.9), (50, 76, 12, 0.9), (50, 62, 8, 0.9), (150, 62, 8, 0.9)]

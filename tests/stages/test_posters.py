@@ -26,11 +26,12 @@ def printed(frame: RgbdFrame, slope: float) -> RgbdFrame:
 def caps(frame: RgbdFrame) -> int:
     """Return how many caps the stages of graphs/pick.yaml find."""
     net, detect = (
-        CapNet(radius_px=(8, None), min_score=0.05),
+        CapNet(radius_px=(8, None), min_score=0.05, beside_depth=0.8),
         PhaseHough(radius_px=(8, None), min_score=0.1, use_learned=True),
     )
-    circles = detect.process(frame, *net.process(frame))
-    return len(CapFit(min_score=0.5).process(frame, circles)[2])
+    mask, learned = net.process(frame)
+    circles = detect.process(frame, mask, learned)
+    return len(CapFit(min_score=0.5).process(frame, circles, learned)[2])
 
 
 @pytest.mark.parametrize("name", ["first-bed", "dense", "brown", "lab"])
