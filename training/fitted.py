@@ -22,7 +22,7 @@ from mushpipe.core.truth import Ignore, Truth
 from mushpipe.evaluate.matching import circle_iou
 from mushpipe.stages.cap_fit import CapFit, seen_by
 from mushpipe.stages.cap_kin import kin_of, unlike
-from mushpipe.stages.cap_verify import BESIDE, FILE, FIT, MODELS, NAMES, features, flat
+from mushpipe.stages.cap_verify import BESIDE, FEW, FILE, FIT, MODELS, NAMES, features, flat
 from mushpipe.stages.phase_hough import PhaseHough
 from mushpipe.stages.verifier import LIMIT
 from training.harder import harder
@@ -37,7 +37,7 @@ NEUTRAL = 0.3  # IoU with a mushroom that need not be found, from which on a cir
 SETTINGS = [
     {"use_learned": net, "use_depth": deep} for deep in (True, False) for net in (False, True)
 ]
-FEW = ("fitted_few", "fitted_few" + BESIDE)
+OF_FEW = (FEW, FEW + BESIDE)
 SQUARED = ("misfit", "tilt", "aspect", "lean")  # for these
 # What they are asked about are caps by so much; a share of half, as in their training, loses caps
 # that a stereo camera shows badly, and 0.91, as in all scenes, keeps cups.
@@ -102,7 +102,7 @@ def teaches(rows: Floats, model: str) -> Bools:
     names = MODELS[model]
     fitted, alike, beside = np.isfinite(rows[:, [NAMES.index(name) for name in KNOWN]]).T
     use = (fitted == (FIT[0] in names)) & (beside == ("learned" in names))
-    if model in FEW:
+    if model in OF_FEW:
         return np.asarray(use & ~alike)
     return np.asarray(use & np.isfinite(rows[:, [NAMES.index(name) for name in names]]).all(axis=1))
 
@@ -121,7 +121,7 @@ def main() -> None:
     all_of_them = tuple(map(np.concatenate, zip(usual, few, strict=True)))
     models = {}
     for model, names in MODELS.items():
-        chosen = (all_of_them, SQUARED, SHARE) if model in FEW else (usual, (), None)
+        chosen = (all_of_them, SQUARED, SHARE) if model in OF_FEW else (usual, (), None)
         taught, squared, share = chosen
         rows, right = (part[teaches(taught[0], model)] for part in taught)
         table = rows[:, [NAMES.index(name) for name in names]]

@@ -31,11 +31,12 @@ LEAST_SEEN, LEAST_CHANCE = 0.005, 1e-6  # logits have no end
 FIT = ("misfit", "tilt", "aspect", "moved", "resized", "lean")
 NAMES = ("score", *FIT, "unlike", "learned")
 BESIDE = "_learned"  # ends the name of a model beside a network
+FEW = "fitted_few"  # where few circles are surely caps
 # What is known decides which model is asked; each is over some of these features.
 ALONE = {
     "fitted": ("score", *FIT),
     "fitted_kin": ("score", *FIT, "unlike"),
-    "fitted_few": ("score", *FIT),  # where few circles are surely caps
+    FEW: ("score", *FIT),
     "seen_kin": ("score", "unlike"),
 }
 MODELS = ALONE | {name + BESIDE: (*names, "learned") for name, names in ALONE.items()}
@@ -111,14 +112,15 @@ def chances(
         unlike: (N,) how unlike the sure caps they are, NaN where that is not known.
         fits: Of these circles, if there is depth.
         learned: (N,) how far each is a circle of a network (`phase_learned.agreement`), if there is
-            one: it has models of its own. What it speaks for counts, and what it speaks against
-            counts half: of real caps it is blind to more than of those that it was trained on.
+            one: it has models of its own. What it speaks for counts, and, but where few are sure,
+            what it speaks against counts half: of real caps it is blind to more than of those that
+            it was trained on.
     """
     table = np.nan_to_num(features(circles, unlike, fits, learned))
     model = {name: _said(name, table, learned is not None) for name in ALONE}
     chance, alike = circles.score, model["seen_kin"]
     if fits is not None:
-        fitted = np.where(np.isfinite(unlike), model["fitted"], model["fitted_few"])
+        fitted = np.where(np.isfinite(unlike), model["fitted"], model[FEW])
         chance = np.where(fits.valid, fitted, chance)
         low = flat(fits, circles.score, unlike, learned)
         chance = np.where(low, np.minimum(chance, FLAT_CHANCE), chance)
@@ -132,6 +134,8 @@ def _said(name: str, table: Floats, beside: bool) -> Floats:
     if not beside:
         return alone
     with_it = probability(table, _models()[name + BESIDE])
+    if name == FEW:  # of what it is blind to, as many are cups and stumps
+        return with_it
     both = (_logit(alone, LEAST_CHANCE) + _logit(with_it, LEAST_CHANCE)) / 2
     return np.maximum(with_it, 1 / (1 + np.exp(-both)))
 
