@@ -77,7 +77,7 @@ def progress_bar(size: Callable[[], int] | None = None) -> Iterator[Any]:
     if not stderr.is_terminal:
         jit = sys.modules.get("mushpipe.core.jit")  # of a graph that has kernels
         if jit is not None and jit.cold():
-            logging.getLogger("mushpipe").info("the first run of all compiles: a minute")
+            logging.getLogger("mushpipe").info("the first run of all compiles: a minute or two")
         yield None
         return
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())

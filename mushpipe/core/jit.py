@@ -66,7 +66,7 @@ if not os.environ.get("NUMBA_CACHE_DIR"):
 
 
 def cold() -> bool:
-    """Return whether nothing was compiled yet: the first run of all takes a minute more."""
+    """Return whether nothing was compiled yet: the first run of all takes a minute or two more."""
     return next(Path(numba.config.CACHE_DIR).rglob("*.nbi"), None) is None  # type: ignore[attr-defined]
 
 
