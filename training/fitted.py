@@ -20,10 +20,11 @@ from mushpipe import Circles, RgbdFrame
 from mushpipe.core.arrays import Bools, Floats
 from mushpipe.core.truth import Ignore, Truth
 from mushpipe.evaluate.matching import circle_iou
-from mushpipe.stages.cap_fit import CapFit, seen_by
+from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.cap_kin import kin_of, unlike
 from mushpipe.stages.cap_verify import BESIDE, FEW, FILE, FIT, MODELS, NAMES, features, flat
 from mushpipe.stages.phase_hough import PhaseHough
+from mushpipe.stages.phase_learned import seen_by
 from mushpipe.stages.verifier import LIMIT
 from training.harder import harder
 from training.logistic import fit, write
@@ -85,7 +86,8 @@ def samples(cases: Iterable[Case], stumps: bool = False) -> tuple[Floats, Floats
             for circles, deep, learned in detected(frame):
                 fits = stage.fit(frame.gray, frame.depth_m, frame.camera, circles) if deep else None
                 use = np.isfinite(label := labels(circles, case.truth, stumps))
-                other, seen = unlike(kin_of(frame.color, circles)), seen_by(learned, circles)
+                other = unlike(kin_of(frame.color, circles))
+                seen = None if learned is None else seen_by(learned, circles)
                 if fits is not None:
                     use &= fits.valid & ~flat(fits, circles.score, other, seen)
                 rows.append(features(circles, other, fits, seen)[use])

@@ -140,12 +140,9 @@ def _ancestors(node: Node, nodes: list[Node]) -> set[str]:
     found: set[str] = set()
     above = nodes[: nodes.index(node)]
     for port in node.ports.inputs:
-        wanted = node.asked.get(port.name)
-        for other in reversed(above):
-            fits = any(issubclass(t, port.type) for t in other.ports.outputs)
-            if fits and wanted in (None, other.name):
-                found |= {other.name} | _ancestors(other, nodes)
-                break
+        if link := _nearest(port, node.asked.get(port.name), above):
+            producer = next(other for other in above if other.name == link.producer)
+            found |= {producer.name} | _ancestors(producer, nodes)
     return found
 
 

@@ -30,7 +30,7 @@ from mushpipe.stages.cap_order import Order, by_depth
 from mushpipe.stages.cap_solve import Habit, Noise
 from mushpipe.stages.cap_verify import chances
 from mushpipe.stages.discs import discs_of
-from mushpipe.stages.phase_learned import agreement
+from mushpipe.stages.phase_learned import seen_by
 from mushpipe.stages.surface_fit import fit_tops, sources, variance_along, without_tip
 from mushpipe.stages.upright import Up, pixel_rays, upright
 from mushpipe.stages.warm_up import example_circles, example_frame
@@ -138,7 +138,8 @@ class CapFit(Stage):
         if self.min_score is None:
             return circles.score
         kin = kin_of(frame.color, circles)
-        chance = chances(circles, unlike(kin), fits, seen_by(learned, circles))
+        seen = None if learned is None else seen_by(learned, circles)
+        chance = chances(circles, unlike(kin), fits, seen)
         return np.where(clods(frame.color, circles, kin), np.minimum(chance, CLOD_CHANCE), chance)
 
     def _kept(
@@ -218,14 +219,6 @@ class CapFit(Stage):
         along = variance_along(without_tip(*tops)[0], tops[1], size, pixel)
         fits.surface[rows] = points[fitted]
         fits.sigma_surface[rows, 2] = np.maximum(fits.sigma_surface[rows, 2], np.sqrt(along))
-
-
-def seen_by(learned: Circles | None, circles: Circles) -> Floats | None:
-    """Return how far each circle (N,) is one of a network; None where there is no network."""
-    if learned is None:
-        return None
-    # a copy, for what is read-only needs another kernel
-    return agreement(discs_of(circles), np.array(circles.radius), learned)
 
 
 def _locations(fits: Fits, source: Bytes) -> Locations:

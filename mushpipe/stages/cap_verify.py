@@ -15,7 +15,7 @@ import numpy as np
 from mushpipe import Circles
 from mushpipe.core.arrays import Bools, Floats
 from mushpipe.stages.cap_batch import Fits
-from mushpipe.stages.verifier import package_file, probability, read_models
+from mushpipe.stages.verifier import logistic, logit, package_file, read_models
 
 FILE = "fitted.yaml"
 ROUND = 0.6  # height over radius; a rounder cap is no more, and no less, likely one
@@ -27,7 +27,7 @@ EDGED = 5  # unless it has an edge in so many of 32 directions,
 ALIKE, PLAIN = 1.0, 0.6  # and is less unlike the sure caps and has a higher score,
 KINDRED, SEEN = 0.2, 0.7  # or is just like them, and a network sees it so plainly
 FLAT_CHANCE = 0.01
-LEAST_SEEN, LEAST_CHANCE = 0.005, 1e-6  # logits have no end
+LEAST_SEEN = 0.005  # logits have no end
 FIT = ("misfit", "tilt", "aspect", "moved", "resized", "lean")
 NAMES = ("score", *FIT, "unlike", "learned")
 BESIDE = "_learned"  # ends the name of a model beside a network
@@ -130,14 +130,13 @@ def chances(
 
 def _said(name: str, table: Floats, beside: bool) -> Floats:
     """Return what a model says (N,) of features (N, F), or that and the one beside a network."""
-    alone = probability(table, _models()[name])
+    alone = logit(table, _models()[name])
     if not beside:
-        return alone
-    with_it = probability(table, _models()[name + BESIDE])
+        return logistic(alone)
+    with_it = logit(table, _models()[name + BESIDE])
     if name == FEW:  # of what it is blind to, as many are cups and stumps
-        return with_it
-    both = (_logit(alone, LEAST_CHANCE) + _logit(with_it, LEAST_CHANCE)) / 2
-    return np.maximum(with_it, 1 / (1 + np.exp(-both)))
+        return logistic(with_it)
+    return logistic(np.maximum(with_it, (alone + with_it) / 2))
 
 
 @lru_cache(maxsize=1)

@@ -27,6 +27,7 @@ from mushpipe.stages.phase_learned import (
     candidates_of,
     largest_of,
     of_radii,
+    seen_by,
     with_bare,
     without_clods,
 )
@@ -177,7 +178,7 @@ class PhaseHough(Stage):
         circles = with_bare(circles, bare, found.shapes, radius, order[score >= LIKELY])
         if learned is None or not found.relief.known:
             return circles
-        seen = agreement(discs_of(circles), np.array(circles.radius), learned)
+        seen = seen_by(learned, circles)
         self._contradiction.look(frame.header.sequence, circles, seen == 0, found.learned)
         return without_clods(frame.color, circles, seen)
 
@@ -237,8 +238,7 @@ class PhaseHough(Stage):
         if not relief.known:
             return sure
         discs, score = discs_of(sure), np.minimum(sure.score, _BARE)
-        possible = self._plausible(discs, relief.heights(discs), relief)
-        kept = possible & (score >= self.min_score)
+        kept = (score >= self.min_score) & self._plausible(discs, relief.heights(discs), relief)
         return Circles(sure.center, sure.radius, score).take(kept)
 
     def _load(self) -> Models:

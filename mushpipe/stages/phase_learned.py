@@ -11,7 +11,15 @@ from mushpipe.core.arrays import Bools, Bytes, Floats, Ints32, Singles
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.cap_clod import darker, ground_of, off_ground
 from mushpipe.stages.cap_kin import tones_of
-from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE, Radii, certain_first, iou, lens
+from mushpipe.stages.discs import (
+    LEAST_OF_RANGE,
+    MOST_OF_RANGE,
+    Radii,
+    certain_first,
+    discs_of,
+    iou,
+    lens,
+)
 
 _AROUND = 4.0  # px; a circle of a network is not more exact than that
 _SAME = 0.5  # IoU from which on an outline is that of a circle
@@ -56,6 +64,12 @@ def agreement(shapes: Floats, radius: Floats, learned: Circles) -> Floats:
     return _agreement(shapes, radius, learned.center, learned.radius, learned.score)
 
 
+def seen_by(learned: Circles, circles: Circles) -> Floats:
+    """Return how far each circle (N,) is one of a network's, as from `agreement`."""
+    # a copy, for what is read-only needs another kernel
+    return agreement(discs_of(circles), np.array(circles.radius), learned)
+
+
 def without_clods(color: Bytes, circles: Circles, seen: Floats) -> Circles:
     """Return the circles but for those that look like the dark soil they lie on.
 
@@ -67,7 +81,7 @@ def without_clods(color: Bytes, circles: Circles, seen: Floats) -> Circles:
     Args:
         color: (H, W, 3) RGB.
         circles: Those accepted.
-        seen: (N,) how far each is a circle of the network, as from `agreement`.
+        seen: (N,) how far each is a circle of the network, from `seen_by`.
     """
     corner = np.array([color.shape[1] - 1, color.shape[0] - 1])
     room = np.minimum(circles.center, corner - circles.center)

@@ -64,8 +64,13 @@ def weights_of(model: dict[str, Any], features: Sequence[str]) -> Floats:
     return weights
 
 
-def probability(table: Floats, weights: Floats) -> Floats:
-    """Return the probabilities (N,) of rows of features (N, F)."""
+def logit(table: Floats, weights: Floats) -> Floats:
+    """Return the logits (N,) of rows of features (N, F)."""
     mean, scale, weight, square = weights[:-1].T
     z = np.clip((table - mean) / scale, -LIMIT, LIMIT)
-    return np.asarray(1 / (1 + np.exp(-(weights[-1, 2] + z @ weight + (z * z) @ square))))
+    return np.asarray(weights[-1, 2] + z @ weight + (z * z) @ square)
+
+
+def logistic(logits: Floats) -> Floats:
+    """Return the probabilities (N,) of logits (N,)."""
+    return np.asarray(1 / (1 + np.exp(-logits)))

@@ -8,7 +8,7 @@ import pytest
 from mushpipe import Circles, DepthSource, RgbdFrame
 from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.cap_verify import FILE, FLAT_CHANCE, NAMES, chances, features
-from mushpipe.stages.verifier import LIMIT, package_file, probability, read_models
+from mushpipe.stages.verifier import LIMIT, logistic, logit, package_file, read_models
 from tests.stages.caps import CAMERA, cap, circles_of, draw, frame_from
 
 BED = 0.44
@@ -177,7 +177,7 @@ def test_what_looks_unlike_the_sure_caps_is_less_likely_one_and_likeness_is_no_r
     frame = frame_from(depth, gray)
     fits = CapFit(up="camera").fit(frame.gray, frame.depth_m, CAMERA, circles)
     models = read_models(package_file(FILE), ["fitted"], NAMES)
-    fitted = probability(np.nan_to_num(features(circles, UNKNOWN, fits)), models["fitted"])
+    fitted = logistic(logit(np.nan_to_num(features(circles, UNKNOWN, fits)), models["fitted"]))
     fitted = np.where(fits.valid, fitted, circles.score)
     for some, alone in ((fits, fitted), (None, circles.score)):
         beside = [chances(circles, np.full(6, far), some) for far in np.linspace(0, 6, 13)]
@@ -216,4 +216,4 @@ def test_the_probability_is_the_logistic_of_clipped_standardised_features() -> N
     first = 0.2 + 0.7 * 1 - 0.1 * 1 - 0.4 * 0.5 + 0.3 * 0.25
     second = 0.2 + 0.7 * LIMIT - 0.1 * LIMIT**2 + 0.4 * LIMIT + 0.3 * LIMIT**2
     expected = 1 / (1 + np.exp(-np.array([first, second])))
-    assert probability(rows, weights) == pytest.approx(expected)
+    assert logistic(logit(rows, weights)) == pytest.approx(expected)
