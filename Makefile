@@ -5,6 +5,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+# Python compiles what is imported; to compile all that was installed takes most of a minute more.
+INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check --no-compile
 
 .PHONY: demo test lint types docs unit test-slow recordings clean
 
@@ -22,11 +24,11 @@ $(VENV)/bin/python:
 	  else echo "install python3-venv first: sudo apt-get install python3-venv"; exit 1; fi; }
 
 $(STAMP): $(VENV)/bin/python pyproject.toml
-	$(BIN)/pip install --quiet --disable-pip-version-check --editable .
+	$(INSTALL) --editable .
 	@touch $@
 
 $(STAMP)-dev: $(VENV)/bin/python pyproject.toml
-	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	$(INSTALL) --editable '.[dev]'
 	@touch $@ $(STAMP)
 
 # open3d needs libGL and libEGL; the tests that use it say so and are skipped without them.
@@ -74,7 +76,7 @@ render = for part in $$(seq $(CORES)); do $(BIN)/python -m training.net.scenes -
   --part $$((part - 1)) --of $(CORES) & pids="$$pids $$!"; done; for pid in $$pids; do wait $$pid || exit 1; done
 .PHONY: train train-seeds train-taught
 train: $(STAMP) system-libraries
-	$(BIN)/pip install --quiet --editable '.[train]' --extra-index-url $(TORCH_INDEX)
+	$(INSTALL) --editable '.[train]' --extra-index-url $(TORCH_INDEX)
 	$(call render,640)
 	nice $(BIN)/python -m training.net.judge > $(NET)/shipped.txt & \
 	  OMP_NUM_THREADS=1 $(MAKE) --always-make $(NET)/seed-1.onnx && wait
@@ -85,7 +87,7 @@ train-seeds: train
 	$(BIN)/python -m training.net.judge --models $(NET)/seed-0.onnx $(NET)/seed-1.onnx $(NET)/seed-2.onnx
 
 train-taught: $(STAMP) system-libraries
-	$(BIN)/pip install --quiet --editable '.[train]'
+	$(INSTALL) --editable '.[train]'
 	$(call render,2000)
 	$(BIN)/python -m training.net.taught --out $(NET)
 	$(BIN)/python -m training.net.joined --weights $(NET)/taught-1.pt $(NET)/taught-0.pt $(NET)/taught-2.pt
@@ -118,7 +120,7 @@ traced: $(STAMP) system-libraries
 	  if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
 	    apt-get update -qq && apt-get install -y -qq libllvm19 >/dev/null; \
 	  else echo "note: Mitsuba needs LLVM 16 or newer: sudo apt-get install libllvm19"; fi; }
-	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[traced]'
+	$(INSTALL) --editable '.[traced]'
 	$(BIN)/python -m training.traced --out $(TRACED)
 	$(BIN)/python -m training.net.judge --peers --recordings $(TRACED)/*.mcap
 	for graph in pick classic; do $(BIN)/mushpipe eval graphs/$$graph.yaml --recordings $(TRACED); done

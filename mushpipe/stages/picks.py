@@ -104,7 +104,10 @@ class MakePicks(Stage):
                 "by that z",
                 self.T_base_camera.frame,
             )
-        hidden_share(Circles(np.full((1, 2), 4.0), np.ones(1), np.ones(1)), np.ones(1), (8, 8))
+        one, unknown = Circles(np.full((1, 2), 4.0), np.ones(1), np.ones(1)), Locations.unknown(1)
+        hidden_share(one, unknown.distance, (8, 8))
+        clearance(one, unknown, self._above(unknown))
+        Tracks().update(one, unknown, (8, 8), 0, 0)
 
     def process(
         self,
@@ -199,7 +202,7 @@ class MakePicks(Stage):
         place = locations.position
         if self.T_base_camera is not None:
             place = self.T_base_camera.points(place)
-        return place[:, :2]
+        return np.ascontiguousarray(place[:, :2])  # as the kernels want it
 
     def _chosen(self, picks: Picks, up: Floats, hidden: Floats) -> Rows:
         """Return the rows that are given, the first to pick first; without depth comes last."""

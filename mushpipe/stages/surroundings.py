@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.distance import cdist
 
 from mushpipe.core.arrays import Floats, Ints
 from mushpipe.core.jit import jit
 from mushpipe.core.tables import Circles, Locations
 from mushpipe.stages.cap_order import paint
 from mushpipe.stages.discs import discs_of
+from mushpipe.stages.pairs import distances
 
 
 def hidden_share(circles: Circles, distance: Floats, image: tuple[int, int]) -> Floats:
@@ -76,6 +76,6 @@ def clearance(circles: Circles, locations: Locations, above: Floats) -> Floats:
 
 def _gaps(place: Floats, radius: Floats) -> Floats:
     """Return the gaps (N, N) between circles; there is none to itself."""
-    gaps = cdist(place, place) - radius[:, None] - radius[None]
+    gaps = distances(place, place) - radius[:, None] - radius[None]
     np.fill_diagonal(gaps, np.inf)
-    return np.asarray(gaps)
+    return gaps

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import uniform_filter
-from scipy.optimize import linear_sum_assignment
-from scipy.spatial.distance import cdist
 
 from mushpipe.core.arrays import Floats, Ints, Rows
 from mushpipe.core.tables import Circles, Columns, Locations, column
+from mushpipe.stages.pairs import assigned, distances
 
 GATE = 0.5  # farthest that a mushroom may be from where it is expected, in radii
 NEAR = 0.4  # gates, root mean square; of those that come there by chance it is 0.7
@@ -105,12 +103,12 @@ class Tracks:
 
 def _flat(new: Sightings, old: Sightings) -> Floats:
     """Return how far each new mushroom (N) is from each old one (M) in the image, in gates."""
-    return _steps(new.center, old.center) / _gates(new.radius, old.radius)
+    return distances(new.center, old.center) / _gates(new.radius, old.radius)
 
 
 def _deep(new: Sightings, old: Sightings) -> Floats:
     """Return the same (N, M) in 3D, NaN where that is not known."""
-    return _steps(new.position, old.position) / _gates(new.size, old.size)
+    return distances(new.position, old.position) / _gates(new.size, old.size)
 
 
 def _resized(new: Sightings, old: Sightings) -> Floats:
@@ -118,21 +116,19 @@ def _resized(new: Sightings, old: Sightings) -> Floats:
     return np.abs(new.radius[:, None] - old.radius[None]) / _gates(new.radius, old.radius)
 
 
-def _steps(new: Floats, old: Floats) -> Floats:
-    return cdist(new, old) if len(new) and len(old) else np.zeros((len(new), len(old)))
-
-
 def _gates(new: Floats, old: Floats) -> Floats:
     return GATE * np.minimum(new[:, None], old[None])
 
 
-def _assign(distances: Floats, resized: Floats) -> tuple[Rows, Rows]:
+def _assign(apart: Floats, resized: Floats) -> tuple[Rows, Rows]:
     """Return the rows and columns of the pairs: as many as there can be, as near as can be."""
-    # A pair outside its gate costs more than any number of pairs inside theirs.
-    near = distances <= 1
-    rows, columns = linear_sum_assignment(np.where(near, np.hypot(distances, resized), 1e6))
-    inside = near[rows, columns]
-    return rows[inside], columns[inside]
+    n, m = apart.shape
+    cost = np.full((n, m + n), np.inf)
+    cost[:, :m] = np.where(apart <= 1, np.hypot(apart, resized), np.inf)
+    cost[:, m:][np.eye(n, dtype=bool)] = 1e6  # to stay alone: more than any number of pairs
+    columns = assigned(cost)
+    rows = np.flatnonzero(columns < m)
+    return rows, columns[rows]
 
 
 def _by_chance(found: Floats, number: int) -> bool:
@@ -181,7 +177,7 @@ def _at_rest(new: Sightings, old: Sightings) -> bool:
 
     Large ones may all be in theirs after a step that takes the small ones out of it.
     """
-    step = np.median(_steps(new.center, old.center).min(axis=0))
+    step = np.median(distances(new.center, old.center).min(axis=0))
     return bool(step < GATE / 2 * min(new.radius.min(), old.radius.min()))
 
 
@@ -193,6 +189,8 @@ def _common_shift(new: Sightings, old: Sightings) -> Floats:
     cells -= cells.min(axis=0) - 1  # with a margin, because a peak may lie between cells
     shape = cells.max(axis=0) + 2
     votes = np.bincount(np.ravel_multi_index(tuple(cells.T), shape), minlength=shape.prod())
-    around = uniform_filter(votes.reshape(shape).astype(np.float32), 3, mode="constant")
+    votes = votes.reshape(shape)
+    rolled = [np.roll(votes, (v, u), (0, 1)) for v in (-1, 0, 1) for u in (-1, 0, 1)]
+    around = np.sum(rolled, axis=0)
     peak = np.unravel_index(around.argmax(), around.shape)
     return np.asarray(np.median(steps[(np.abs(cells - peak) <= 1).all(axis=1)], axis=0))

@@ -8,17 +8,17 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 MAIN = [sys.executable, "-c", "from mushpipe.cli import main; main()"]
-GRAPH = """\
+GRAPH = f"""\
 mushpipe: 1
-source: {use: synthetic, width: 320, height: 240, distance: 0.3, max_frames: 3, count: 12}
+source: {{use: mcap, path: {ROOT / "recordings" / "first-bed.mcap"}}}
 stages:
-  segment: {use: otsu}
-  open:    {use: opening}
-  detect:  {use: hough}
-  locate:  {use: nearest-depth}
-  pick:    {use: picks}
+  segment: {{use: otsu}}
+  open:    {{use: opening}}
+  detect:  {{use: hough}}
+  locate:  {{use: nearest-depth}}
+  pick:    {{use: picks}}
 sinks:
-  log: {use: mcap, path: out.mcap}
+  log: {{use: mcap, path: out.mcap}}
 """
 
 

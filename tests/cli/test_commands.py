@@ -93,7 +93,7 @@ def test_export_prints_one_json_line_per_frame(folder: Path) -> None:
 
 def test_record_then_replay_by_source_with_paths_relative_to_the_shell(folder: Path) -> None:
     recorded = mushpipe(
-        "record", "--source", "synthetic", "--frames", 2, "-o", "a.mcap", cwd=folder
+        "record", "--source", "synthetic", "--frames", 1, "-o", "a.mcap", cwd=folder
     )
     assert recorded.returncode == 0, recorded.stderr
     (folder / "elsewhere").mkdir()
@@ -140,7 +140,7 @@ def test_faults_of_a_graph_are_printed_together_with_places(folder: Path) -> Non
             "error: empty.mcap: the file is empty\n",
         ),
         (
-            ["run", "graph.yaml", "--start", "3"],
+            ["run", "graph.yaml", "--source", "synthetic", "--start", "3"],
             EXIT_USAGE,
             "error: --start 3.0: unknown setting 'start' of 'synthetic'\n",
         ),
@@ -231,7 +231,7 @@ def test_a_failing_stage_leaves_a_capsule_that_fails_again(folder: Path) -> None
     assert done.returncode == EXIT_FAILED
     assert "failed on frame 1: RuntimeError: no frame like this" in done.stderr
     assert "1 failed" in done.stderr
-    again = mushpipe("run", "failures/failure-synthetic-bed-0-segment-1.mcap", cwd=folder)
+    again = mushpipe("run", "failures/failure-first-bed-segment-1.mcap", cwd=folder)
     assert again.returncode == EXIT_FAILED
     assert "failed on frame 1: RuntimeError: no frame like this" in again.stderr
 
@@ -390,7 +390,7 @@ def test_names_that_cannot_be_are_told_in_words(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["run", "graph.yaml", "--frames", str(2**63)], "max_frames of 'synthetic'"),
+        (["run", "graph.yaml", "--frames", str(2**63)], "max_frames of 'mcap'"),
         (["run", "graph.yaml", "--source", "a.mcap", "--end", "1e300"], "end of 'mcap'"),
         (["run", "graph.yaml", "--set", "pick.memory_s=1e300"], "memory_s of 'picks'"),
         (["bench", "graph.yaml", "--frames", str(2**63)], "Invalid value for '--frames'"),

@@ -12,14 +12,15 @@ import pytest
 from mcap.reader import make_reader
 
 from mushpipe.core.errors import EXIT_INTERRUPTED
+from tests.cli.shell import ROOT
 
-GRAPH = """\
+GRAPH = f"""\
 mushpipe: 1
-source: {use: synthetic, max_frames: 1000000, count: 3}
+source: {{use: mcap, path: {ROOT / "recordings" / "first-bed.mcap"}, loop: 0}}
 stages:
-  say: {use: "./say.py:Say"}
+  say: {{use: "./say.py:Say"}}
 sinks:
-  log: {use: mcap, path: out.mcap, frames: false}
+  log: {{use: mcap, path: out.mcap, frames: false}}
 """
 # Tells on stdout that a frame is being processed, so that the test need not guess by time.
 SAY = """\

@@ -131,7 +131,7 @@ def test_nothing_is_emptied_where_another_run_writes_one_of_the_files(
     other = folder / ({"out.mcap", "out.rrd"} - {held}).pop()
     other.write_bytes(b"of the first run")
     before = (folder / held).read_bytes()
-    options = ("--source", "synthetic", "--frames", 1, "--set", "log.path=./out.mcap")
+    options = ("--frames", 1, "--set", "log.path=./out.mcap")
     done = mushpipe("run", "graph.yaml", *options, cwd=folder)
     assert done.returncode == EXIT_USAGE
     assert f"{held} cannot be written: another run is writing it" in done.stderr
