@@ -104,10 +104,10 @@ class MakePicks(Stage):
                 "by that z",
                 self.T_base_camera.frame,
             )
-        one, unknown = Circles(np.full((1, 2), 4.0), np.ones(1), np.ones(1)), Locations.unknown(1)
-        hidden_share(one, unknown.distance, (8, 8))
-        clearance(one, unknown, self._above(unknown))
-        Tracks().update(one, unknown, (8, 8), 0, 0)
+        two, unknown = Circles(np.full((2, 2), 4.0), np.ones(2), np.ones(2)), Locations.unknown(2)
+        hidden_share(two, unknown.distance, (8, 8))
+        clearance(two, unknown, self._above(unknown))
+        Tracks().update(two, unknown, (8, 8), 0, 0)
 
     def process(
         self,
