@@ -46,7 +46,9 @@ class RealsenseSource(ReplaySource):
     """
 
     file: GraphPath | None = Field(None, description="a `.bag` recording to play; none is live")
-    serial: str | None = Field(None, description="serial number, where several are connected")
+    serial: str | int | None = Field(
+        None, description="serial number, where several are connected"
+    )
     color: str = Field("640x480", pattern=_SIZE, description="size of the colour images, px")
     depth: str | None = Field(
         "640x480", pattern=_SIZE, description="size of the depth images, px; null is without depth"
@@ -117,7 +119,7 @@ class RealsenseSource(ReplaySource):
             UsageError: No such file, or a setting this camera does not have.
             InputError: The file is no RealSense recording.
         """
-        self._serial = self.serial
+        self._serial = None if self.serial is None else str(self.serial)
         if self.live and self.speed:
             raise UsageError("source.speed is for recordings; a camera has its own pace")
         self._link = self._connect()

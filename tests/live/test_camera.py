@@ -204,9 +204,15 @@ def test_options_are_set_and_told():
             "no depth of 160x120 @ 60; it has: 160x120 @ 30",
         ),
         (
-            {"serial": "1"},
+            {"serial": "01"},
             DeviceError,
-            "no camera has the serial number 1; "
+            "no camera has the serial number 01; "
+            "connected: Software-Device Simulated SR300 617203001234",
+        ),
+        (
+            {"serial": 617203001233},  # as YAML reads it
+            DeviceError,
+            "no camera has the serial number 617203001233; "
             "connected: Software-Device Simulated SR300 617203001234",
         ),
     ],

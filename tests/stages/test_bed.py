@@ -130,7 +130,7 @@ def test_a_leaning_plane_goes_on_to_the_border(size: tuple[int, int], relief: bo
     plane = (-0.45 / (RAY @ normal_of(20, 250)))[:height, :width]
     found = bed_depth(plane.astype(np.float32), relief)
     assert found is not None
-    assert found == pytest.approx(plane, abs=3e-4)
+    np.testing.assert_allclose(found, plane, rtol=0, atol=3e-4)
 
 
 LENSES = {  # px and coefficients at 640 x 480, as the cameras' colour streams have them
@@ -149,5 +149,5 @@ def test_a_camera_s_lens_bends_the_plane_of_pixels_little(lens: str, turn: float
     plane = (-0.45 * np.cos(np.radians(20)) / seen).astype(np.float32)
     found = bed_depth(plane)
     assert found is not None
-    assert found == pytest.approx(plane, abs=1e-3)
+    np.testing.assert_allclose(found, plane, rtol=0, atol=1e-3)
     assert np.abs(found - plane).mean() < 2e-4

@@ -26,7 +26,7 @@ def bed() -> tuple[RgbdFrame, Circles, np.ndarray]:
 
 def fitted(frame: RgbdFrame, circles: Circles) -> Fits:
     assert frame.camera is not None
-    return CapFit().fit(frame.gray, np.nan_to_num(frame.depth_m), frame.camera, circles)
+    return CapFit().fit(frame.gray, frame.depth_m, frame.camera, circles)
 
 
 def turned(frame: RgbdFrame, rotation: np.ndarray, middle: np.ndarray) -> RgbdFrame:

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from functools import cache
 
 import cv2
 import numpy as np
 import pytest
 
 from mushpipe import Camera, Circles, Header, Mask, RgbdFrame
-from mushpipe.core.truth import TRUTH_TOPIC
 from mushpipe.evaluate.truth import read_truth
 from mushpipe.sources.mcap import McapSource
 from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.cap_gap import EdgeWatch, edge_gaps, usual
 from mushpipe.stages.phase_hough import PhaseHough
-from tests.stages.frames import SIMULATED, simulated
+from tests.stages.frames import SIMULATED
 
 
 def disc(x: float, y: float, radius: float) -> np.ndarray:
@@ -115,22 +115,39 @@ def test_depth_that_is_not_aligned_to_colour_is_told_of(caplog: pytest.LogCaptur
     assert "px to the left" in message
 
 
-def look_at_beds(count: int, right: int) -> None:
-    """Let a watch look at so many beds, with depth so many px to the right of colour."""
+BEDS = ("dense", "first-bed", "moving", "tilted", "harsh-light", "brown", "sparse")
+
+
+@cache
+def beds(name: str) -> list[tuple[RgbdFrame, Circles]]:
+    """The frames of a recording, and the mushrooms in them that count."""
+    known, found = read_truth(SIMULATED / f"{name}.mcap"), []
+    for frame in McapSource(path=SIMULATED / f"{name}.mcap").frames():
+        caps = known.frames[known.place(frame.header)].caps
+        caps = caps.take(caps.ignore == 0)
+        found.append((frame, Circles(caps.center, caps.radius, np.ones(len(caps)))))
+    return found
+
+
+def moved(frame: RgbdFrame, right: int, down: int = 0) -> RgbdFrame:
+    """The frame with its depth so many px to the right and below of colour."""
+    assert frame.depth is not None
+    return replace(frame, depth=np.roll(frame.depth, (down, right), axis=(0, 1)))
+
+
+def look_at_beds(right: int) -> None:
+    """Let a watch look at all beds, with depth so many px to the right of colour."""
     watch = EdgeWatch()
-    for seed in range(9000, 9000 + count):
-        frame = simulated(seed, width=640, height=480, count=80)
-        truth = frame.attached[TRUTH_TOPIC].take(frame.attached[TRUTH_TOPIC].ignore == 0)
-        assert frame.depth is not None
-        seen = replace(frame, depth=np.roll(frame.depth, right, axis=1))
-        watch.look(seen, Circles(truth.center, truth.radius, np.ones(len(truth))), 0.7)
+    for name in BEDS:
+        for frame, circles in beds(name):
+            watch.look(moved(frame, right), circles, 0.7)
 
 
 @pytest.mark.parametrize("right", [0, -3, -5, 5])
 def test_shadows_beside_all_caps_keep_nobody_from_telling(
     right: int, caplog: pytest.LogCaptureFixture
 ) -> None:
-    look_at_beds(6, right)
+    look_at_beds(right)
     found = [re.search(r"([\d.]+) px to the (left|right)", text) for text in caplog.messages]
     told = [float(f[1]) * (1 if f[2] == "right" else -1) for f in found if f]
     assert len(told) == len(found) == (right != 0)
@@ -142,7 +159,7 @@ def test_depth_far_beside_colour_is_told_of_as_well(
     right: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Farther than edges are looked for."""
-    look_at_beds(10, right)
+    look_at_beds(right)
     (message,) = caplog.messages
     assert "not aligned to colour" in message
 
@@ -151,12 +168,9 @@ def test_depth_far_beside_colour_is_told_of_as_well(
 def test_a_camera_that_stands_still_is_told_of_after_a_while_and_only_once(
     shift: tuple[int, int], caplog: pytest.LogCaptureFixture
 ) -> None:
-    for seed in (9000, 9001):
-        frame = simulated(seed, width=640, height=480, count=50)
-        truth = frame.attached[TRUTH_TOPIC].take(frame.attached[TRUTH_TOPIC].ignore == 0)
-        assert frame.depth is not None
-        seen = replace(frame, depth=np.roll(frame.depth, shift[::-1], axis=(0, 1)))
-        watch, circles = EdgeWatch(), Circles(truth.center, truth.radius, np.ones(len(truth)))
+    for name in BEDS[:2]:
+        frame, circles = beds(name)[0]
+        seen, watch = moved(frame, *shift), EdgeWatch()
         caplog.clear()
         for _ in range(59):
             watch.look(seen, circles, 0.7)

@@ -11,7 +11,7 @@ from mushpipe import RgbdFrame
 from mushpipe.sources.mcap import McapSource
 from mushpipe.stages.cap_net import CapNet
 from mushpipe.stages.phase_hough import PhaseHough
-from tests.stages.frames import SIMULATED, simulated
+from tests.stages.frames import SIMULATED, first
 
 NET = CapNet(radius_px=(8, None), min_score=0.05, beside_depth=0.8)
 
@@ -23,21 +23,17 @@ def told(*frames: RgbdFrame) -> None:
         stage.process(frame, *NET.process(frame))
 
 
-def bed(seed: int) -> RgbdFrame:
-    return simulated(seed, width=640, height=480, count=60)
-
-
 def test_of_what_belongs_together_nothing_is_said(caplog: pytest.LogCaptureFixture) -> None:
     for path in sorted(SIMULATED.glob("*.mcap")):
         told(next(iter(McapSource(path=path).frames())))
     assert caplog.messages == []
 
 
-@pytest.mark.parametrize("seed", [9100, 9101])
+@pytest.mark.parametrize(("colour", "depth"), [("first-bed", "tilted"), ("moving", "brown")])
 def test_depth_of_another_scene_is_told_of_once(
-    seed: int, caplog: pytest.LogCaptureFixture
+    colour: str, depth: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    mixed = replace(bed(seed), depth=bed(seed + 50).depth)
+    mixed = replace(first(colour), depth=first(depth).depth)
     told(*[mixed] * 40)
     assert len(caplog.messages) == 1
     assert "positions are not to be trusted" in caplog.messages[0]
@@ -45,13 +41,12 @@ def test_depth_of_another_scene_is_told_of_once(
 
 def test_caps_that_only_depth_shows_are_told_of(caplog: pytest.LogCaptureFixture) -> None:
     """As where depth stands still and the bed was picked meanwhile."""
-    empty = simulated(9102, width=640, height=480, count=0)
-    told(replace(empty, depth=bed(9102).depth))
+    told(replace(first("plane-51"), depth=first("first-bed").depth))
     assert "caps that depth shows cap-net sees nothing in colour" in caplog.messages[0]
 
 
 def test_depth_in_which_no_caps_are_is_told_of(caplog: pytest.LogCaptureFixture) -> None:
-    frame = bed(9103)
+    frame = first("first-bed")
     assert frame.depth is not None
     flat = np.full_like(frame.depth, 4000)
     told(replace(frame, depth=flat))
