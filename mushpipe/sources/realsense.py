@@ -46,9 +46,7 @@ class RealsenseSource(ReplaySource):
     """
 
     file: GraphPath | None = Field(None, description="a `.bag` recording to play; none is live")
-    serial: str | int | None = Field(
-        None, description="serial number, where several are connected"
-    )
+    serial: str | int | None = Field(None, description="serial number, where several are connected")
     color: str = Field("640x480", pattern=_SIZE, description="size of the colour images, px")
     depth: str | None = Field(
         "640x480", pattern=_SIZE, description="size of the depth images, px; null is without depth"
