@@ -1,10 +1,15 @@
-"""The program in a process of its own, as a shell starts it, and a graph for it."""
+"""The program in a process of its own, and a graph for it."""
 
 from __future__ import annotations
 
+import multiprocessing
+import os
 import subprocess
 import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from mushpipe.cli import main
 
 ROOT = Path(__file__).parents[2]
 MAIN = [sys.executable, "-c", "from mushpipe.cli import main; main()"]
@@ -22,6 +27,38 @@ sinks:
 """
 
 
+FORKS = multiprocessing.get_context("forkserver")
+FORKS.set_forkserver_preload(
+    ["mushpipe.console", "mushpipe.sources.mcap", "mushpipe.stages.picks", "mushpipe.sinks.mcap"]
+)
+
+
 def mushpipe(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command = [*MAIN, *map(str, arguments)]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
+    """Run a command line in a process of its own.
+
+    It is forked from one that has imported the program, which takes longer than most of what is
+    tested; `MAIN` is the program as a shell starts it.
+    """
+    command = list(map(str, arguments))
+    with TemporaryDirectory() as folder:
+        out, err = Path(folder, "out"), Path(folder, "err")
+        process = FORKS.Process(target=_run, args=(command, cwd, dict(os.environ), out, err))
+        process.start()
+        process.join()
+        code = process.exitcode
+        assert code is not None
+        return subprocess.CompletedProcess(command, code, _read(out), _read(err))
+
+
+def _run(command: list[str], cwd: Path, environment: dict[str, str], out: Path, err: Path) -> None:
+    for number, path in ((1, out), (2, err)):
+        os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT), number)
+    os.chdir(cwd)
+    os.environ.clear()
+    os.environ.update(environment)
+    sys.argv = ["mushpipe", *command]
+    main()
+
+
+def _read(path: Path) -> str:
+    return path.read_bytes().decode().replace("\r\n", "\n")
