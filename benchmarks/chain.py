@@ -19,7 +19,7 @@ import tempfile
 from pathlib import Path
 from statistics import median
 
-from growth import stage_times
+from growth import measure
 
 ROOT = Path(__file__).resolve().parents[1]
 GRAPHS = {
@@ -71,8 +71,8 @@ def judged(graph: Path, recordings: list[Path], frames: int) -> dict[str, float]
 
 def milliseconds(graph: Path, recording: Path) -> float:
     """Return the time of all stages on the first frame of a recording, ms."""
-    once = stage_times(graph, recording, 1)["all stages"]
-    return once if once > SLOW_MS else stage_times(graph, recording, 15)["all stages"]
+    once = measure(graph, [recording], 1)[0]["all stages"]
+    return once if once > SLOW_MS else measure(graph, [recording], 15)[0]["all stages"]
 
 
 def main() -> None:
