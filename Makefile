@@ -15,7 +15,7 @@ demo: $(STAMP)
 	$(BIN)/mushpipe run graphs/demo.yaml
 
 test: $(STAMP)-dev system-libraries
-	$(MAKE) --jobs 2 types docs lint
+	$(MAKE) --jobs 2 lint docs types kernels-pose kernels-others
 	$(MAKE) unit
 
 $(VENV)/bin/python:
@@ -56,7 +56,14 @@ docs: $(STAMP)-dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --site-dir out/site
 
 # The tests start the program some hundred times: Python shall not compile its modules each time.
-unit: export PYTHONDONTWRITEBYTECODE :=
+unit kernels-pose kernels-others: export PYTHONDONTWRITEBYTECODE :=
+
+# Two processes of tests that begin together would compile the same kernels, each for itself.
+.PHONY: kernels-pose kernels-others
+kernels-pose: $(STAMP)-dev
+	$(BIN)/python -c 'from mushpipe.stages.cap_fit import CapFit; CapFit().open()'
+kernels-others: $(STAMP)-dev
+	$(BIN)/mushpipe run graphs/classic.yaml --set pose.use=surface-fit
 
 # On two cores in three fifths of the time. Fixtures of a file are made once: a file stays on one core.
 unit: $(STAMP)-dev
