@@ -125,7 +125,7 @@ def _assign(apart: Floats, resized: Floats) -> tuple[Rows, Rows]:
     n, m = apart.shape
     cost = np.full((n, m + n), np.inf)
     cost[:, :m] = np.where(apart <= 1, np.hypot(apart, resized), np.inf)
-    cost[:, m:][np.eye(n, dtype=bool)] = 1e6  # to stay alone: more than any number of pairs
+    np.fill_diagonal(cost[:, m:], 1e6)  # to stay alone: more than any number of pairs
     columns = assigned(cost)
     rows = np.flatnonzero(columns < m)
     return rows, columns[rows]
@@ -189,8 +189,8 @@ def _common_shift(new: Sightings, old: Sightings) -> Floats:
     cells -= cells.min(axis=0) - 1  # with a margin, because a peak may lie between cells
     shape = cells.max(axis=0) + 2
     votes = np.bincount(np.ravel_multi_index(tuple(cells.T), shape), minlength=shape.prod())
-    votes = votes.reshape(shape)
-    rolled = [np.roll(votes, (v, u), (0, 1)) for v in (-1, 0, 1) for u in (-1, 0, 1)]
-    around = np.sum(rolled, axis=0)
+    around = votes.reshape(shape)
+    for axis in (0, 1):
+        around = around + np.roll(around, 1, axis) + np.roll(around, -1, axis)
     peak = np.unravel_index(around.argmax(), around.shape)
     return np.asarray(np.median(steps[(np.abs(cells - peak) <= 1).all(axis=1)], axis=0))
