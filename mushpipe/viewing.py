@@ -86,7 +86,8 @@ def view(
     from mushpipe.console import interruptible, set_up_logging
     from mushpipe.core.errors import DependencyError, UsageError
     from mushpipe.core.overwriting import spare
-    from mushpipe.sinks.rerun import RerunSink, has_display
+    from mushpipe.sinks.rerun import RerunSink
+    from mushpipe.sinks.rerun_server import has_display
 
     set_up_logging(False)
     spare(save, file)

@@ -6,16 +6,11 @@ import logging
 import os
 import shutil
 import signal
-import socket
 import subprocess
-import sys
-import time
 from collections import deque
-from contextlib import suppress
 from io import FileIO
 from pathlib import Path
 from typing import Any, ClassVar, Literal
-from urllib.parse import urlsplit
 
 from pydantic import Field, PrivateAttr, model_validator
 
@@ -26,10 +21,17 @@ from mushpipe.core.recorder import RecordingError
 from mushpipe.core.transform import Transform, base_of
 from mushpipe.sinks.rerun_memory import Remembering
 from mushpipe.sinks.rerun_pace import Pace
+from mushpipe.sinks.rerun_server import (
+    PATIENCE_S,
+    PORT,
+    answers,
+    check_reachable,
+    has_display,
+    reached_at,
+    start,
+)
 
 logger = logging.getLogger("mushpipe")
-PORT = 9876  # the SDK's own default
-PATIENCE_S = 20.0
 LIVE_IMAGE_HZ = 5.0
 # On a full disk the SDK's writer dies, and whoever waits for it hangs (0.41), even at the end of
 # the program. So the sink ends before that.
@@ -106,6 +108,8 @@ class RerunSink(Sink):
             RecordingError: The disk is full but for a last reserve.
             DependencyError: There is no display for `spawn`, or the server does not start.
         """
+        if not self.index:  # the SDK warns of it, and reads this as it is imported
+            os.environ.setdefault("RUST_LOG", "warn,re_log_encoding::rrd::file_sink=error")
         import rerun as rr
 
         from mushpipe.sinks.rerun_style import log_start, workspace_of
@@ -138,7 +142,7 @@ class RerunSink(Sink):
         """Return the addresses to send to, after starting what is to be started there."""
         urls = []
         if self.connect is not None:
-            _check_reachable(self.connect)
+            check_reachable(self.connect)
             urls.append(self.connect)
         if self.spawn:
             if not has_display():
@@ -146,13 +150,13 @@ class RerunSink(Sink):
                     "there is no display to open a viewer on: set 'save' to a file, or 'serve' to "
                     "a port and look from another machine"
                 )
-            if not _answers("127.0.0.1", PORT):  # a viewer that is open already will do
-                _start("127.0.0.1", PORT, "--memory-limit", self.memory)
+            if not answers("127.0.0.1", PORT):  # a viewer that is open already will do
+                start("127.0.0.1", PORT, "--memory-limit", self.memory)
             urls.append(f"rerun+http://127.0.0.1:{PORT}/proxy")
         if self.serve is not None:
             limit = ("--server-memory-limit", self.memory)
-            self._server = _start(self.host, self.serve, "--serve-grpc", *limit)
-            urls.append(f"rerun+http://{_reached_at(self.host)}:{self.serve}/proxy")
+            self._server = start(self.host, self.serve, "--serve-grpc", *limit)
+            urls.append(f"rerun+http://{reached_at(self.host)}:{self.serve}/proxy")
             logger.info("look at it with: rerun %s", urls[-1])
         return urls
 
@@ -239,11 +243,6 @@ class RerunSink(Sink):
             self._server = None
 
 
-def has_display() -> bool:
-    """Return whether a viewer can open a window here."""
-    return sys.platform != "linux" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
-
-
 class _Notes(logging.Handler):
     """Keeps what is logged until it can be written at a frame."""
 
@@ -253,48 +252,3 @@ class _Notes(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         self.waiting.append(record)
-
-
-def _reached_at(host: str) -> str:
-    return "127.0.0.1" if host in ("0.0.0.0", "::") else host
-
-
-def _answers(host: str, port: int) -> bool:
-    try:
-        socket.create_connection((host, port), timeout=2).close()
-    except OSError:
-        return False
-    return True
-
-
-def _check_reachable(url: str) -> None:
-    parts = urlsplit(url)
-    if not url.startswith("rerun") or not parts.hostname:
-        raise UsageError(f"connect: '{url}' is not like rerun+http://127.0.0.1:{PORT}/proxy")
-    if not _answers(parts.hostname, parts.port or PORT):
-        raise UsageError(f"connect: no viewer answers at {parts.hostname}:{parts.port or PORT}")
-
-
-def _start(host: str, port: int, *arguments: str) -> subprocess.Popen[bytes]:
-    """Start Rerun as a process of its own: the SDK's own servers always listen on 0.0.0.0.
-
-    Raises:
-        UsageError: The port is taken.
-        DependencyError: It does not come up.
-    """
-    if _answers(_reached_at(host), port):
-        raise UsageError(f"port {port} is taken: choose another, or end what listens there")
-    server = subprocess.Popen(
-        [sys.executable, "-m", "rerun", "--bind", host, "--port", str(port), *arguments],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,  # Ctrl-C is for the run, which then ends the server
-    )
-    deadline = time.monotonic() + PATIENCE_S
-    while not _answers(_reached_at(host), port):
-        if server.poll() is not None or time.monotonic() > deadline:
-            with suppress(ProcessLookupError):  # it may have ended by itself
-                os.killpg(server.pid, signal.SIGKILL)
-            raise DependencyError(f"Rerun does not start on {host}:{port}")
-        time.sleep(0.05)
-    return server

@@ -12,6 +12,7 @@ from mushpipe import RunInfo, Trace
 from mushpipe.cli import app
 from mushpipe.core.errors import DependencyError, GraphError, InputError, UsageError
 from mushpipe.sinks.rerun import RerunSink
+from tests.cli.shell import mushpipe
 from tests.io.bags import COLOR, color_at, rgbd, write_bag
 from tests.io.values import make_circles, make_frame, make_picks, record, trace_of
 
@@ -42,6 +43,23 @@ def test_a_recording_is_shown_as_it_is(tmp_path: Path) -> None:
     rows = entities(out)
     assert rows["/camera/image/color"] == rows["/camera/cloud"] == 2
     assert "/camera/image/picks" not in rows
+
+
+def test_a_file_without_an_index_is_no_warning_where_none_was_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("RUST_LOG", raising=False)
+    recording = record(tmp_path / "bed.mcap", [Trace(make_frame(0), {}, {})])
+    graph = tmp_path / "view.yaml"
+    for index, footer in (("true", True), ("false", False)):
+        graph.write_text(
+            f"mushpipe: 1\nsource: {{use: mcap, path: {recording}}}\nstages: {{}}\n"
+            f"sinks: {{view: {{use: rerun, save: {index}.rrd, index: {index}}}}}\n"
+        )
+        run = mushpipe("run", graph, cwd=tmp_path)
+        assert run.returncode == 0
+        assert "WARN" not in run.stderr
+        assert (b"RRF2FOOT" in (tmp_path / f"{index}.rrd").read_bytes()[-64:]) is footer
 
 
 def test_a_damaged_file_is_shown_as_far_as_it_goes(tmp_path: Path) -> None:

@@ -98,7 +98,7 @@ def test_what_is_sent_to_a_viewer_arrives(tmp_path: Path) -> None:
 def test_a_viewer_is_opened_for_this_machine_only(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    started, stored, start = [], tmp_path / "shown.rrd", rerun._start
+    started, stored, start = [], tmp_path / "shown.rrd", rerun.start
 
     def instead(host: str, port: int, *arguments: str) -> subprocess.Popen[bytes]:
         started.append((host, arguments, start(host, port, "--save", str(stored))))
@@ -106,7 +106,7 @@ def test_a_viewer_is_opened_for_this_machine_only(
 
     monkeypatch.setenv("DISPLAY", ":99")
     monkeypatch.setattr(rerun, "PORT", free_port())
-    monkeypatch.setattr(rerun, "_start", instead)
+    monkeypatch.setattr(rerun, "start", instead)
     try:
         for _ in range(2):  # the viewer of the first run takes the second one too
             feed(RerunSink(spawn=True, memory="300MB"), [trace_of(make_frame(), pick=make_picks())])
