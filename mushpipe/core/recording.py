@@ -149,7 +149,8 @@ class RecordingReader:
     ) -> Iterator[Raw]:
         """Yield the messages of some topics (default all) with start_ns <= log_time < end_ns.
 
-        They come by log time, see above, or in the order in which they were written.
+        They come by log time, see above; with ``as_written``, for what mushpipe wrote, in the order
+        of the file within a chunk.
         """
         index, seen = self.index(), 0
         # A chunk that is skipped or corrupt may be the one that declares them.
@@ -162,7 +163,7 @@ class RecordingReader:
             past = end_ns is not None and chunk.message_start_time >= end_ns
             return chunk.message_end_time >= start_ns and not past
 
-        turned = bool(index.side_by_side) and not as_written
+        turned = bool(index.side_by_side)  # mushpipe leaves none: another program wrote it anew
         records = self._by_log_time(overlaps) if turned else self._records(overlaps, as_written)
         for record in records:
             if isinstance(record, Schema):

@@ -10,7 +10,7 @@ from mushpipe.core.errors import InputError
 from mushpipe.core.geometry import Camera
 from mushpipe.sources.images import GIVEN_CAMERA, decode_camera, distortion
 from mushpipe.sources.recorded import RecordedSource
-from mushpipe.sources.topics import Topics, is_beside
+from mushpipe.sources.topics import Topics, is_beside, other_camera
 
 Recorded = Camera | None | EllipsisType  # which is that nothing was stated yet
 _RECTIFIED = ("rect", "rectified")  # image_rect_color, as ROS has it; others say image_color_rect
@@ -28,6 +28,7 @@ class Calibration:
         topic: Where it is recorded; None where it is not, or does not matter.
         camera: What the last message says.
         stated: Whether there was a message, be it word that there is none.
+        stamp_ns: Of the last message.
     """
 
     def __init__(
@@ -39,12 +40,13 @@ class Calibration:
         self.topic = topics.camera if settings.camera is None else None
         self.camera: Camera | None = None
         self.stated = False
+        self.stamp_ns = 0
         self._frame_id = ""
         self._warn = warn
 
-    def read(self, message: Any, frame_id: str) -> Camera | None:
+    def read(self, message: Any, stamp_ns: int, frame_id: str) -> Camera | None:
         """Return what a message says; errors as of `decode_camera`."""
-        self._frame_id = frame_id
+        self.stamp_ns, self._frame_id = stamp_ns, frame_id
         name = self.color.split("/")
         words = {word for part in name for word in part.split("_")}
         if "image_rect_raw" in name and any(distortion(message)):
@@ -67,8 +69,8 @@ class Calibration:
     def recorded(self) -> Recorded:
         """Return what to use for an image that came now.
 
-        A calibration that changes holds from there on, not for images that wait for their depth;
-        the first one does.
+        A calibration that changes holds from there on and for the image of its own stamp, not for
+        others that wait for their depth; the first one does.
         """
         return self.camera if self.stated else ...
 
@@ -100,7 +102,10 @@ class Calibration:
         return camera
 
     def _require_same_frame(self, frame_id: str) -> None:
-        """Raise InputError for another camera's, unless it was named or stands beside colour."""
+        """Raise InputError for another camera's, unless it was named or stands beside colour.
+
+        Two drivers may give one name to the frames of their cameras: what topics say is told.
+        """
         if self.topic is None or self.settings.camera_topic or is_beside(self.topic, self.color):
             return
         if self._frame_id and frame_id and self._frame_id != frame_id:
@@ -108,4 +113,10 @@ class Calibration:
                 f"the only calibration ({self.topic}) is of frame '{self._frame_id}', "
                 f"colour is in '{frame_id}': name it if it holds for colour (--set "
                 f"source.camera_topic={self.topic}), or set {GIVEN_CAMERA}"
+            )
+        if other_camera(self.topic.rpartition("/")[0], self.color):
+            self._warn(
+                f"by its name, the only calibration ({self.topic}) is of another camera than "
+                f"colour ({self.color}): positions and sizes are wrong if it is; where it holds "
+                f"for colour, name it (--set source.camera_topic={self.topic})"
             )

@@ -142,7 +142,8 @@ def _decode_compressed_depth(message: Any, scale: float | None) -> tuple[NDArray
     if image is None or image.dtype != np.uint16 or image.ndim != 2:
         raise ValueError(f"compressed depth '{message.format}' holds no 16-bit image")
     if not message.format.startswith("32FC1"):
-        return image, _known_scale(scale, 0.001, "16UC1")
+        encoding = "mono16" if message.format.startswith("mono16") else "16UC1"
+        return image, _known_scale(scale, _DEPTH[encoding][1], encoding)
     _, a, b = struct.unpack_from("<iff", data)
     metres = np.zeros(image.shape, np.float32)
     np.divide(np.float32(a), image - np.float32(b), out=metres, where=image > 0)

@@ -31,10 +31,10 @@ class McapSource(RecordedSource, ReplaySource):
     """
 
     path: GraphPath = Field(description="the recording")
-    start: float = Field(0.0, ge=0, description="skip so many seconds of the recording")
-    end: float | None = Field(
-        None, gt=0, le=1e9, description="stop at this second of the recording"
+    start: float = Field(
+        0.0, ge=0, description="skip so many seconds of the recording, from its first colour image"
     )
+    end: float | None = Field(None, gt=0, le=1e9, description="stop at this second, counted alike")
     loop: int = Field(1, ge=0, description="how many times to play it; 0 is for ever")
 
     _counts: Counter[str] = PrivateAttr(default_factory=Counter)
@@ -56,8 +56,8 @@ class McapSource(RecordedSource, ReplaySource):
             InputError: It is empty, not MCAP, or without the topics that are asked for.
         """
         self._reader = RecordingReader(self.path)
-        index, _ = self._chosen(self._reader)
-        length = (index.end_ns - index.start_ns) / 1e9
+        index, topics = self._chosen(self._reader)
+        length = (index.end_ns - self._begin_ns(self._reader, topics)) / 1e9
         if self.end is not None and self.end <= self.start:
             raise UsageError(f"{self.path}: end, {self.end:g} s, is not after start")
         if self.start > length:
@@ -87,7 +87,8 @@ class McapSource(RecordedSource, ReplaySource):
         reader = self._reader or RecordingReader(self.path)
         index, topics = self._chosen(reader)
         numbered = MANIFEST in index.metadata or GRAPH in index.metadata
-        beside = beside_of(index.channels) if numbered else set()
+        played = set(vars(topics).values())
+        beside = beside_of(index.channels.keys() - played) if numbered else set()
         if topics.depth is None:
             logger.warning(NO_DEPTH, self.path.name)
             if self.use_depth and (others := untold_images(index, topics.color)):
@@ -96,12 +97,22 @@ class McapSource(RecordedSource, ReplaySource):
                     " or ".join(f"--set source.depth_topic={topic}" for topic in others),
                 )
         player = Player(self, str(self.path), topics, beside, numbered, self._counts)
-        yield from self._passes(player, reader, index)
+        yield from self._passes(player, reader)
 
-    def _passes(self, player: Player, reader: RecordingReader, index: Index) -> Iterator[RgbdFrame]:
+    def _begin_ns(self, reader: RecordingReader, topics: Topics) -> int:
+        """Return when the first colour image was logged, for `start` and `end`.
+
+        Calibrations and transforms may have been logged at any time before, be it 0.
+        """
+        asked = self.start or self.end is not None
+        first = next(reader.messages({topics.color}), None) if asked else None
+        return first.message.log_time if first else 0
+
+    def _passes(self, player: Player, reader: RecordingReader) -> Iterator[RgbdFrame]:
         # Without a start nothing is skipped, so that nothing can be lost unnoticed.
-        start_ns = index.start_ns + round(self.start * 1e9) if self.start else 0
-        end_ns = None if self.end is None else index.start_ns + round(self.end * 1e9)
+        begin_ns = self._begin_ns(reader, player.topics)
+        start_ns = begin_ns + round(self.start * 1e9) if self.start else 0
+        end_ns = None if self.end is None else begin_ns + round(self.end * 1e9)
         camera = _first_camera(player, reader, start_ns)
         if camera is None and self.camera is None:
             logger.warning(NO_CAMERA, self.path.name, f" ({player.error})" if player.error else "")
@@ -111,7 +122,7 @@ class McapSource(RecordedSource, ReplaySource):
             player.calibration.camera, player.frames = camera, 0
             # mushpipe writes frames in order, whatever their stamps; ROS sorts by what it logged
             messages = reader.messages(player.wanted(), start_ns, end_ns, player.numbered)
-            played = player.play(messages, hold=bool(player.beside))
+            played = player.play(messages, hold=True)
             for frame in played if turn else _watched(played, self.path):
                 header = frame.header
                 first, last = first or header, header

@@ -5,13 +5,15 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Set
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import starmap
 from typing import Any, TypeVar
 
 from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoders
 from mcap_ros2.decoder import DecoderFactory as Ros2Decoders
 
 from mushpipe.core import wire
+from mushpipe.core.arrays import Bytes
 from mushpipe.core.errors import InputError
 from mushpipe.core.geometry import Camera
 from mushpipe.core.recording import CONVERT, ZSTD, Raw
@@ -74,6 +76,7 @@ class Player:
         self._size: tuple[int, ...] | None = None  # of the last
         self._factories = (ProtobufDecoders(), Ros2Decoders())
         self._warned: set[str] = set()
+        self._last: _Color | None = None
         self._found_beside: dict[tuple[int, int], dict[str, wire.Message]] = {}
 
     def wanted(self) -> set[str]:
@@ -86,21 +89,25 @@ class Player:
 
         Args:
             messages: Of the topics `wanted`, in order.
-            hold: Whether to keep a frame back until the next message of the camera: what belongs
-                to it may come after its images. In a stream, it comes before them.
+            hold: Whether to keep a frame back until the next image: what belongs to it may come
+                after its images, as truth does, and in a bag of ROS its calibration. In a stream,
+                it comes before them.
         """
         pairing: Pairing[_Color, _Depth] = Pairing(round(self.settings.pair_tolerance_ms * 1e6))
-        ready: list[RgbdFrame] = []
+        ready: list[tuple[_Color, _Depth | None]] = []
         for raw in messages:
             if raw.channel.topic in self.beside:
                 self._put_beside(raw)
                 continue
-            if not hold:
-                yield from map(self._with_beside, self._take(raw, pairing))
+            if raw.channel.topic == self.calibration.topic:
+                self.calibrate(raw, "calibrations")
                 continue
-            yield from map(self._with_beside, ready)
+            yield from starmap(self._frame, ready)
             ready = list(self._take(raw, pairing))
-        yield from map(self._with_beside, (*ready, *self._frames(pairing.finish())))
+            if not hold:
+                yield from starmap(self._frame, ready)
+                ready = []
+        yield from starmap(self._frame, (*ready, *pairing.finish()))
         if min(pairing.color_alone, pairing.depth_alone) > self.frames / 2:
             self._warn(
                 f"most colour and depth images are without a partner: their stamps differ by more "
@@ -112,20 +119,20 @@ class Player:
         self.counts["colour images without depth"] += pairing.color_alone
         self.counts["depth images without colour"] += pairing.depth_alone
 
-    def _take(self, raw: Raw, pairing: Pairing[_Color, _Depth]) -> Iterator[RgbdFrame]:
+    def _take(
+        self, raw: Raw, pairing: Pairing[_Color, _Depth]
+    ) -> Iterator[tuple[_Color, _Depth | None]]:
         number = raw.message.sequence if self.numbered else 0
-        if raw.channel.topic == self.calibration.topic:
-            self.calibrate(raw, "calibrations")
-        elif raw.channel.topic == self.topics.depth:
+        if raw.channel.topic == self.topics.depth:
             depth = self._decode(raw, self._depth)
             if depth:
-                yield from self._frames(pairing.add_depth(*depth, number))
-        else:
-            color = self._decode(raw, self._color)
-            if color and self.topics.depth is None:
-                yield self._frame(color, None)
-            elif color:
-                yield from self._frames(pairing.add_color(color[0].stamp_ns, color, number))
+                yield from pairing.add_depth(*depth, number)
+            return
+        self._last = color = self._decode(raw, self._color)
+        if color and self.topics.depth is None:
+            yield color, None
+        elif color:
+            yield from pairing.add_color(color.header.stamp_ns, color, number)
 
     def _put_beside(self, raw: Raw) -> None:
         given = raw.schema
@@ -151,10 +158,14 @@ class Player:
         """
 
         def read(message: Any, raw: Raw) -> Camera | None:
-            return self.calibration.read(message, _stamp(message, raw)[1])
+            return self.calibration.read(message, *_stamp(message, raw))
 
         self.calibration.camera = self._decode(raw, read, what)
         self.calibration.stated = True
+        # Drivers of ROS send it behind its image, mushpipe before.
+        last = None if self.numbered else self._last
+        if last and last.header.stamp_ns == self.calibration.stamp_ns:
+            last.recorded = self.calibration.recorded()
         return self.calibration.camera
 
     def _warn(self, text: str) -> None:
@@ -191,7 +202,7 @@ class Player:
     def _color(self, message: Any, raw: Raw) -> _Color:
         stamp_ns, frame_id = _stamp(message, raw)
         header = Header(stamp_ns, raw.message.sequence, frame_id, raw.message.log_time)
-        return header, decode_color(message), self.calibration.recorded()
+        return _Color(header, decode_color(message), self.calibration.recorded())
 
     def _depth(self, message: Any, raw: Raw) -> tuple[int, _Depth]:
         stated = raw.channel.metadata.get("depth_scale")
@@ -199,13 +210,10 @@ class Player:
         stamp_ns, frame_id = _stamp(message, raw)
         return stamp_ns, (frame_id, *decode_depth(message, scale))
 
-    def _frames(self, pairs: Iterator[tuple[_Color, _Depth | None]]) -> Iterator[RgbdFrame]:
-        return (self._frame(color, depth) for color, depth in pairs)
-
     def _frame(self, color: _Color, depth: _Depth | None) -> RgbdFrame:
-        header, image, recorded = color
-        sequence = header.sequence if self.numbered else self.frames
-        header = replace(header, sequence=sequence)
+        image = color.image
+        sequence = color.header.sequence if self.numbered else self.frames
+        header = replace(color.header, sequence=sequence)
         self.frames += 1
         aligned = says_aligned(self.topics.depth or "", self.topics.color)
         if depth and depth[0] != header.frame_id and not aligned:
@@ -221,10 +229,11 @@ class Player:
         self._watch_size(size, sequence)
         try:
             native, scale = depth[1:] if depth else (None, 0.001)
-            known = self.calibration.of_image(size, self._first or size, header.frame_id, recorded)
-            return RgbdFrame(header, image, native, scale, known)
+            stated = (size, self._first or size, header.frame_id, color.recorded)
+            frame = RgbdFrame(header, image, native, scale, self.calibration.of_image(*stated))
         except (ValueError, InputError) as error:
             raise InputError(f"{self.name}, frame {sequence}: {error}") from error
+        return self._with_beside(frame)
 
     def _watch_size(self, size: tuple[int, ...], sequence: int) -> None:
         if self._size not in (None, size) and self._size:
@@ -233,7 +242,15 @@ class Player:
         self._first, self._size = self._first or size, size
 
 
-_Color = tuple[Header, Any, Recorded]
+@dataclass
+class _Color:
+    """A colour image, and what was recorded as its calibration."""
+
+    header: Header
+    image: Bytes
+    recorded: Recorded
+
+
 _Depth = tuple[str, Any, float]
 
 

@@ -24,7 +24,8 @@ _WORDS = {"depth": ("depth",), "infra": ("infra",), "color": ("color", "colour",
 # What else parts of a topic say of the images, and not of the camera.
 _OF_IMAGES = ("image", "rect", "registered", "stereo")
 _RAW = 1.1  # what a raw image is worth beside compressed ones
-_TRANSPORTS = ("/compressedDepth", "/compressed")
+_OF_DEPTH = "/compressedDepth"
+_TRANSPORTS = (_OF_DEPTH, "/compressed")
 
 
 @dataclass(frozen=True)
@@ -57,17 +58,18 @@ def choose_topics(
         if wanted is not None:
             _check_named(index, path, wanted, kinds)
     images = _images(index)
-    color = color or _one(path, "color", _colors(images))
+    color = color or _one(path, "color", _colors([t for t in images if t != depth]))
     if color is None:
-        found = ", ".join(sorted(index.channels)) or "no topics at all"
+        known = (t if index.counts[t] else f"{t} without a message" for t in sorted(index.channels))
+        found = ", ".join(known) or "no topics at all"
         raise InputError(f"{path}: it holds no colour images (it holds {found}){_of_others(index)}")
     if not use_depth:
         depth = None
     elif depth is None:
         depths = _depths(images)
-        own = [t for t in depths if not _other_camera(t, color)]
+        own = [t for t in depths if not other_camera(t, color)]
         depth = _one(path, "depth", own or depths)
-        if depth and _other_camera(depth, color):
+        if depth and other_camera(depth, color):
             raise InputError(
                 f"{path}: by its name, depth ({depth}) is of another camera than colour ({color}): "
                 f"where it is aligned to it, name it (--set source.depth_topic={depth}); or play "
@@ -136,7 +138,12 @@ def _images(index: Index) -> list[str]:
     for topic in _topics(index, IMAGES):
         twins = (best.get(_base(topic), topic), topic)
         best[_base(topic)] = max(
-            twins, key=lambda t: index.counts[t] * (_RAW if t == _base(t) else 1)
+            # of the compressed ones of depth, image_transport's JPEG of 8 bits is none
+            twins,
+            key=lambda t: (
+                index.counts[t] * (_RAW if t == _base(t) else 1),
+                t.endswith(_OF_DEPTH),
+            ),
         )
     return sorted(best.values())
 
@@ -149,8 +156,8 @@ def _base(topic: str) -> str:
 
 def _calibration(index: Index, path: Path, color: str) -> str | None:
     calibrations = _topics(index, CALIBRATIONS)
-    beside = [t for t in calibrations if is_beside(t, color)]
-    others = [t for t in calibrations if _kind(t) not in ("depth", "infra")]
+    others = [t for t in calibrations if _kind(t) in ("", "color", _kind(color))]
+    beside = [t for t in others if is_beside(t, color)]
     aligned = [t for t in calibrations if says_aligned(t, color)]
     return _one(path, "camera", beside or others or aligned)
 
@@ -163,15 +170,15 @@ def is_beside(calibration: str, color: str) -> bool:
 def says_aligned(depth: str, color: str) -> bool:
     """Return whether names say that depth is aligned to these colour images, of one camera."""
     camera, found, _ = depth.lower().partition(ALIGNED)
-    return bool(found) and color.lower().startswith(camera)
+    return bool(found) and _kind(color) != "infra" and color.lower().startswith(camera)
 
 
-def _other_camera(depth: str, color: str) -> bool:
+def other_camera(topic: str, color: str) -> bool:
     """Return whether two topics name two cameras: /left/color/image and /right/depth/image."""
     words = (*chain(*_WORDS.values()), *_OF_IMAGES)
     cameras = [
-        [part for part in _base(topic).lower().split("/") if part and not _says(part, words)]
-        for topic in (depth, color)
+        [part for part in _base(name).lower().split("/") if part and not _says(part, words)]
+        for name in (topic, color)
     ]
     return any(a != b for a, b in zip(*cameras, strict=False))
 

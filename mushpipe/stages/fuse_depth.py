@@ -107,7 +107,7 @@ class FuseDepth(Stage):
             or not all(0 <= now_ns - stamp <= LONGEST_NS for stamp in self._stamps_ns[:1])
         ):
             memory = self._forget(frame)
-        held = sum(now_ns - stamp <= LONGEST_NS for stamp in self._stamps_ns)
+        held = sum(0 <= now_ns - stamp <= LONGEST_NS for stamp in self._stamps_ns)
         self._stamps_ns = (now_ns, *self._stamps_ns)[: self.frames - 1]
         noise = SIGMAS * self.depth_noise_mm / 1000 / frame.depth_scale
         growth = SIGMAS * self.depth_noise_per_m / 1000

@@ -209,7 +209,7 @@ def test_messages_come_by_time_where_chunks_hold_one_topic_after_the_other(tmp_p
     reader = RecordingReader(topic_by_topic(tmp_path / "x.mcap", *logged, each=each))
     assert times(reader) == list(range(10, 30))
     assert times(reader, {"/b"}, 12, 16) == [13, 15]
-    assert [raw.message.log_time for raw in reader.messages(as_written=True)][:3] == [10, 12, 14]
+    assert [raw.message.log_time for raw in reader.messages(as_written=True)] == times(reader)
     assert reader.damage == []
 
 

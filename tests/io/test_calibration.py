@@ -13,6 +13,7 @@ from mushpipe.core.errors import InputError
 from mushpipe.core.geometry import Camera
 from mushpipe.sources.mcap import McapSource
 from tests.io.bags import (
+    ALIGNED,
     COLOR,
     COLOR_INFO,
     CX,
@@ -30,6 +31,7 @@ from tests.io.bags import (
     compressed,
     converted,
     depth_at,
+    depth_pixels,
     drain,
     encoded,
     play,
@@ -279,6 +281,23 @@ def test_a_change_of_size_that_the_calibration_follows_is_played(tmp_path: Path)
     first, second = shrinking()
     frames = play(write_bag(tmp_path, [info_at(0), first, info_at(1, size=SMALL), second]))
     assert [frame.color.shape[:2] for frame in frames] == [(6, 8), (3, 4)]
+
+
+@pytest.mark.parametrize("depth_first", [False, True])
+@pytest.mark.parametrize("with_depth", [False, True])
+def test_a_calibration_may_follow_its_image_as_drivers_of_ros_send_it(
+    depth_first: bool, with_depth: bool, tmp_path: Path
+) -> None:
+    k, entries = (500.0, 0, 1.5, 0, 500.0, 1.0, 0, 0, 1), []
+    for i in range(4):
+        size = SMALL if i >= 2 else (WIDTH, HEIGHT)
+        at = T0 + i * PERIOD
+        color = (COLOR, at, raw_image(color_pixels(i, size), "rgb8", at))
+        depth = [(ALIGNED, at, raw_image(depth_pixels(i, size), "16UC1", at))] * with_depth
+        info = (COLOR_INFO, at, camera_info(at, size, k) if i >= 2 else camera_info(at))
+        entries += [*depth, color, info] if depth_first else [color, info, *depth]
+    found = [camera.fx for camera in cameras(tmp_path, entries) if camera]
+    assert found == [FX, FX, 500.0, 500.0]
 
 
 def test_foxglove_calibration(tmp_path: Path) -> None:

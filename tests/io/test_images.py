@@ -199,6 +199,10 @@ BAD_DEPTH = [
     ),
     (raw_image(MM, "mono16"), "mono16 depth without a unit: set depth_scale (metres per unit)"),
     (
+        compressed(depth_png(MM), "mono16; compressedDepth png"),
+        "mono16 depth without a unit: set depth_scale (metres per unit)",
+    ),
+    (
         raw_image(MM, "64FC1"),
         "depth encoding '64FC1' is not known (known: 16UC1, mono16, 32FC1)",
     ),

@@ -336,6 +336,53 @@ def test_a_summary_may_leave_things_out(tmp_path: Path, missing: str) -> None:
     assert [frame.depth is not None for frame in frames] == [True] * 3
 
 
+def rewritten(path: Path, out: Path, prefix: str = "", by_topic: bool = False) -> Path:
+    """Return a recording as another program writes it: topics renamed, or one in each chunk."""
+    with path.open("rb") as file, out.open("wb") as copy:
+        reader, writer = make_reader(file), Writer(copy, chunk_size=1000)
+        writer.start()
+        for metadata in reader.iter_metadata():
+            writer.add_metadata(metadata.name, metadata.metadata)
+        messages = list(reader.iter_messages(log_time_order=False))
+        if by_topic:
+            messages.sort(key=lambda each: each[1].topic, reverse=True)
+        channels: dict[str, int] = {}
+        for schema, channel, message in messages:
+            topic = channel.topic.replace("/camera", prefix or "/camera", 1)
+            if topic not in channels:
+                known = schema and writer.register_schema(schema.name, schema.encoding, schema.data)
+                made = (topic, channel.message_encoding, known or 0, channel.metadata)
+                channels[topic] = writer.register_channel(*made)
+            times = (message.log_time, message.data, message.publish_time, message.sequence)
+            writer.add_message(channels[topic], *times)
+        writer.finish()
+    return out
+
+
+def numbered_frames(count: int) -> list[RgbdFrame]:
+    """Return frames with their number beside them."""
+    clocks = [Clock(np.array([i]), np.array([1.0]), np.array([0])) for i in range(count)]
+    return [replace(make_frame(i), attached={"/clock": clocks[i]}) for i in range(count)]
+
+
+@pytest.mark.parametrize("prefix", ["/bed1", "/left/camera"])
+def test_topics_of_ones_own_recording_may_be_renamed(tmp_path: Path, prefix: str) -> None:
+    frames = numbered_frames(3)
+    path = record(tmp_path / "a.mcap", list(map(trace_of, frames)))
+    found = play(rewritten(path, tmp_path / "b.mcap", prefix))
+    check_same(found, frames)
+    assert [list(frame.attached) for frame in found] == [["/clock"]] * 3
+
+
+def test_ones_own_recording_may_be_written_anew_topic_by_topic(tmp_path: Path) -> None:
+    frames = numbered_frames(50)
+    path = record(tmp_path / "a.mcap", list(map(trace_of, frames)))
+    found = play(rewritten(path, tmp_path / "b.mcap", by_topic=True))
+    check_same(found, frames)
+    numbers = [json.loads(f.attached["/clock"].data)["number"] for f in found]
+    assert numbers == [[i] for i in range(50)]
+
+
 def test_stamps_that_go_back_neither_turn_frames_round_nor_lose_what_is_beside_them(
     tmp_path: Path,
 ) -> None:

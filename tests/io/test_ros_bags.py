@@ -13,7 +13,7 @@ from foxglove.mcap import MCAPCompression
 from pydantic import ValidationError
 
 from mushpipe.core import edges
-from mushpipe.core.errors import InputError
+from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.types import RgbdFrame
 from mushpipe.sources.mcap import McapSource
 from tests.io.bags import (
@@ -110,6 +110,16 @@ def test_start_and_end_choose_a_range(
         np.testing.assert_array_equal(frame.color, color_pixels(i))
         np.testing.assert_array_equal(frame.depth, depth_pixels(i))
         assert frame.camera is not None
+
+
+def test_the_range_counts_from_the_first_image_whatever_was_logged_before(tmp_path: Path) -> None:
+    (topic, _, info), *images = rgbd(range(5))
+    path = write_bag(tmp_path, [(topic, 0, info), *images])
+    assert len(play(path, start=seconds(2))) == 3
+    assert len(play(path, end=seconds(2))) == 2
+    source = McapSource(path=path, start=60)
+    with pytest.raises(UsageError, match=r"it ends after 0\.132 s, before start, 60 s"):
+        source.open()
 
 
 @pytest.mark.parametrize("settings", [{"start": 60.0}, {"start": 0.09, "end": 0.01}])

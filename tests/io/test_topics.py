@@ -98,6 +98,28 @@ def test_of_a_raw_topic_and_its_compressed_twin_the_raw_one_is_played(tmp_path: 
     np.testing.assert_array_equal(frame.depth, depth_pixels(0))
 
 
+def test_of_the_compressed_twins_of_depth_the_one_made_for_it_is_played(tmp_path: Path) -> None:
+    jpeg = encoded(np.zeros((6, 8), np.uint8), ".jpg")
+    entries = [
+        (COLOR_INFO, T0, camera_info()),
+        color_at(0),
+        (ALIGNED + "/compressed", T0 + 1, compressed(jpeg, "16UC1; jpeg compressed ")),
+        (
+            ALIGNED + "/compressedDepth",
+            T0 + 1,
+            compressed(depth_png(depth_pixels(0)), "16UC1; compressedDepth png"),
+        ),
+    ]
+    np.testing.assert_array_equal(first(tmp_path, entries).depth, depth_pixels(0))
+
+
+def test_a_topic_that_is_named_as_depth_is_not_asked_for_as_colour(tmp_path: Path) -> None:
+    entries = [color_at(0, topic="/cam/image"), depth_at(0, topic="/cam/range")]
+    frame = first(tmp_path, entries, depth_topic="/cam/range")
+    np.testing.assert_array_equal(frame.color, color_pixels(0))
+    np.testing.assert_array_equal(frame.depth, depth_pixels(0))
+
+
 def test_compressed_topics_find_the_calibration_beside_them(tmp_path: Path) -> None:
     png = compressed(encoded(color_pixels(0)[..., ::-1], ".png"), "rgb8; png compressed bgr8")
     entries = [
@@ -222,6 +244,48 @@ def test_the_calibration_of_another_camera_is_refused_unless_it_is_named(
     assert first(tmp_path / "b", entries, camera_topic=topic).camera is not None
 
 
+@pytest.mark.parametrize("frame_id", ["camera_color_optical_frame", ""])
+def test_where_only_names_say_that_a_calibration_is_another_cameras_it_is_told(
+    frame_id: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    topic = "/right/color/camera_info"
+    entries = [(topic, T0, camera_info(frame_id=frame_id)), color_at(0, topic=LEFT)]
+    assert first(tmp_path / "a", entries).camera is not None
+    told = f"by its name, the only calibration ({topic}) is of another camera than colour ({LEFT})"
+    assert sum(told in message for message in caplog.messages) == 1
+    caplog.clear()
+    first(tmp_path / "b", entries, camera_topic=topic)
+    own = [("/left/camera_info", T0, camera_info(frame_id=frame_id)), color_at(0, topic=LEFT)]
+    first(tmp_path / "c", own)
+    assert "another camera" not in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("color", "info"),
+    [("/cam/rgb", "/cam/depth_info"), ("/color_image", "/depth_camera_info")],
+)
+def test_the_calibration_of_depth_in_the_folder_of_colour_is_not_that_of_colour(
+    color: str, info: str, tmp_path: Path
+) -> None:
+    entries = [(info, T0, OTHER_INFO), color_at(0, topic=color)]
+    assert first(tmp_path, entries).camera is None
+
+
+def test_depth_aligned_to_colour_is_not_aligned_to_infrared(tmp_path: Path) -> None:
+    topic = CAMERA + "infra1/image_rect_raw"
+    gray = raw_image(color_pixels(0)[..., :1], "mono8", frame_id="camera_infra1_optical_frame")
+    text = refusal(tmp_path, [(topic, T0, gray), depth_at(0)], color_topic=topic)
+    assert text.startswith(f"depth ({ALIGNED}) is in frame 'camera_color_optical_frame', colour in")
+
+
+def test_infrared_images_that_are_named_have_the_calibration_beside_them(tmp_path: Path) -> None:
+    topic = CAMERA + "infra1/image_rect_raw"
+    gray = raw_image(color_pixels(0)[..., :1], "mono8")
+    entries = [(topic, T0, gray), (CAMERA + "infra1/camera_info", T0, camera_info())]
+    frame = first(tmp_path, entries, color_topic=topic)
+    assert frame.camera is not None
+
+
 def test_the_calibration_of_an_infrared_camera_is_not_that_of_colour(tmp_path: Path) -> None:
     entries = [(CAMERA + "infra1/camera_info", T0, OTHER_INFO), color_at(0)]
     assert first(tmp_path, entries).camera is None
@@ -306,3 +370,15 @@ def test_depth_of_another_camera_is_taken_only_where_it_is_named(
         play(path)
     assert play(path, depth_topic=depth)[0].depth is not None
     assert play(path, use_depth=False)[0].depth is None
+
+
+def test_topics_without_a_message_are_told_apart(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = McapWriter(file)
+        writer.start()
+        schema = writer.register_schema("sensor_msgs/msg/Image", "ros2msg", b"uint32 height\n")
+        writer.register_channel(COLOR, "cdr", schema)
+        writer.finish()
+    with pytest.raises(InputError, match=rf"no colour images \(it holds {COLOR} without a message"):
+        play(path)

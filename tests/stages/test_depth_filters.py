@@ -63,10 +63,16 @@ def test_holes_are_filled_for_a_while() -> None:
 
 @pytest.mark.parametrize("frames", [2, 5, 100])
 @pytest.mark.parametrize("period_ms", [4, 33, 90, 240, 490, 700])
-def test_nothing_that_fills_a_hole_is_older_than_half_a_second(frames: int, period_ms: int) -> None:
+@pytest.mark.parametrize("before", [0, 1, 90])  # frames with later stamps: the clock was set back
+def test_nothing_that_fills_a_hole_is_older_than_half_a_second(
+    frames: int, period_ms: int, before: int
+) -> None:
     stage = FuseDepth(frames=frames)
     whole, hole = np.full(SHAPE, 500, np.uint16), np.full(SHAPE, 500, np.uint16)
     hole[3, 4] = 0
+    for k in range(before):
+        header = Header(10**12 + k * period_ms * 1_000_000, k, "optical")
+        stage.process(replace(frame(whole), header=header))
     stage.process(frame(whole))
     filled = 0
     for k in range(1, 150):
