@@ -121,8 +121,9 @@ def run(
     more = ["foxglove"] if foxglove else []
     plan = _compile(graph, [*overrides, *(set_ or [])], source, more)
     repeated = graph.suffix == ".mcap" and source is None  # its frame is saved already
-    report = execute(plan, manifest or manifest_path(plan), None if repeated else capsules)
-    if repeated and report.processed and not report.failed:
+    beside = graph.with_suffix(".run.json") if repeated else manifest_path(plan)
+    report = execute(plan, manifest or beside, None if repeated else capsules)
+    if repeated and report.processed and report.exit_code == 0:
         stderr.print(NOT_AGAIN, style="yellow")
     raise typer.Exit(report.exit_code)
 

@@ -29,8 +29,8 @@ from mushpipe.core.run import run
 # Names may hold brackets, which are no markup.
 stderr = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
 NOT_AGAIN = (
-    "this frame does not fail again: what failed depends on the frames before it, or on something "
-    "outside of the graph"
+    "this frame does not fail again: the plugin was changed since, or what failed depends on the "
+    "frames before it, or on something outside of the graph"
 )
 
 

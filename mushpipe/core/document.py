@@ -48,6 +48,10 @@ class Document:
 
     def problem(self, at: Location, message: str, hint: str = "", key: bool = False) -> Problem:
         """Place a message at a location, or at the nearest place above it that is in the file."""
+        of_node = at == ("source",) or (len(at) == 2 and at[0] in ("stages", "sinks"))
+        if of_node and at not in self.overrides:  # which the command line may have changed
+            labels = dict.fromkeys(t for key, t in self.overrides.items() if key[:-1] == at)
+            message += f" (with {', '.join(labels)})" if labels else ""
         for end in range(len(at), -1, -1):
             if at[:end] in self.overrides:
                 return Problem(self.overrides[at[:end]], 0, 0, message, hint)

@@ -32,28 +32,30 @@ LEAP_NS = 60 * 10**9
 _READ_ONLY = ("assignment destination is read-only", "output array is read-only")
 
 
-def failure(node: Node, sequence: int | None, error: BaseException) -> StageError:
-    """Say which plugin failed on which frame, keeping the exit code of a known error."""
-    at = "" if sequence is None else f" on frame {sequence}"
+def failure(node: Node, sequence: int | None, error: BaseException, method: str = "") -> StageError:
+    """Say which plugin failed on which frame or where, keeping the exit code of a known error."""
+    at = f" in {method}()" if method else "" if sequence is None else f" on frame {sequence}"
     known = isinstance(error, MushpipeError)
     text = str(error) if known else f"{type(error).__name__}: {error}"
     if isinstance(error, ValueError) and str(error) in _READ_ONLY:
         text += "; frames and tables belong to all stages: copy an array before changing it"
     code = error.exit_code if isinstance(error, MushpipeError) else 1
+    if method in ("open", "close") and not known:
+        text += " (-v says where)"
     if not known:
         logger.debug("where %s '%s' failed:", node.kind, node.name, exc_info=error)
     return StageError(f"{node.kind} '{node.name}' ({node.use}) failed{at}: {text}", code)
 
 
 @contextmanager
-def named(node: Node) -> Iterator[None]:
-    """Say which plugin an error outside of a frame comes from."""
+def named(node: Node, method: str) -> Iterator[None]:
+    """Say which plugin's method an error outside of a frame comes from."""
     try:
         yield
     except MushpipeError:
         raise
     except (Exception, SystemExit) as error:
-        raise failure(node, None, error) from error
+        raise failure(node, None, error, method) from error
 
 
 def plain(value: object) -> Any:
@@ -84,7 +86,7 @@ def files_of(node: Node, run: RunInfo | None = None) -> tuple[Path, ...]:
     """
     plugin = node.plugin
     found: object = ()
-    with named(node):
+    with named(node, "files"):
         if isinstance(plugin, Source):
             found = plugin.files()
         elif isinstance(plugin, Sink) and run is not None:
@@ -105,7 +107,7 @@ def recording_of(node: Node) -> str:
         PluginError: It gave no text.
     """
     found: object = ""
-    with named(node):
+    with named(node, "name"):
         if isinstance(node.plugin, Source):
             found = node.plugin.name()
     if not isinstance(found, str):
@@ -192,14 +194,15 @@ def opened(node: Node, opener: Callable[[], None]) -> Iterator[Plugin]:
     """Open a node, and close it on leaving, whether or not that worked."""
     try:
         # a sink may open standard output itself
-        with named(node), nullcontext() if node.kind == "sink" else prints_aside():
+        aside = nullcontext() if node.kind == "sink" else prints_aside()
+        with named(node, "open"), aside:
             opener()
         yield node.plugin
     except BaseException:
         with suppress(Exception):  # the first error is the one to report
             node.plugin.close()
         raise
-    with named(node):
+    with named(node, "close"):
         node.plugin.close()
 
 

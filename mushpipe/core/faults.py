@@ -42,10 +42,6 @@ def faults_of(
             if item["type"] == "json_invalid":  # half a character: "\ud800", or of a name
                 what = what if use else "the graph"
                 message = "a text in it is not UTF-8: give the file another name"
-            if not place:  # of all settings together, which the command line may have changed
-                texts = (text for key, text in document.overrides.items() if key[:-1] == at)
-                labels = ", ".join(dict.fromkeys(texts))
-                given = f" (with {labels})" if labels else ""
             problems.append(document.problem(path, f"{what}: {message}{given}"))
     return problems
 

@@ -22,6 +22,7 @@ from types import ModuleType
 from typing import Any, cast
 
 import pluggy
+from pluggy import PluginValidationError
 
 from mushpipe.core.errors import DependencyError, PluginError, suggest
 from mushpipe.core.paths import from_home, real
@@ -209,7 +210,9 @@ def register(registry: Registry, points: Iterable[EntryPoint]) -> None:
                 others = manager.get_plugins() - {module}
                 manager.subset_hook_caller("mushpipe_register", others)(registry=registry)
             if sum(map(len, registry.entries.values())) == before:
-                raise PluginError("it registers nothing: is @mushpipe.hookimpl missing?")
+                cure = f"its entry point must name the module, {point.module}, not {point.value}"
+                cure = "is @mushpipe.hookimpl missing?" if isinstance(module, ModuleType) else cure
+                raise PluginError(f"it registers nothing: {cure}")
         except (Exception, SystemExit) as error:
             registry.broken.append(Broken(point.name, distribution, version, _brief(error)))
             if module is not None and manager.is_registered(module):
@@ -221,7 +224,9 @@ def _owner(point: EntryPoint) -> tuple[str, str]:
 
 
 def _brief(error: BaseException) -> str:
-    return f"{type(error).__name__}: {str(error).partition(_MORE)[0]}{_place(error)}"
+    misspelt = isinstance(error, PluginValidationError) and "unknown hook" in str(error)
+    hint = "; expected mushpipe_register" if misspelt else ""
+    return f"{type(error).__name__}: {str(error).partition(_MORE)[0]}{hint}{_place(error)}"
 
 
 def _place(error: BaseException) -> str:

@@ -152,7 +152,12 @@ def _port(plugin: type[Plugin], parameter: Parameter, hints: dict[str, Any]) -> 
             f"{plugin.__qualname__}: '{parameter}' stands for any number of parameters; each input "
             "needs one of its own"
         )
-    if not _is_class(hint) or parameter.kind is not Parameter.POSITIONAL_OR_KEYWORD:
+    if parameter.kind is not Parameter.POSITIONAL_OR_KEYWORD:
+        raise PluginError(
+            f"{plugin.__qualname__}: parameter '{parameter.name}' must be neither positional-only "
+            "nor keyword-only: leave out the '/' or '*'"
+        )
+    if not _is_class(hint):
         raise PluginError(
             f"{plugin.__qualname__}: parameter '{parameter.name}' must be annotated with one type"
         )

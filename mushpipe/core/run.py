@@ -95,7 +95,7 @@ class _Runner:
         source = self.plan.source.plugin
         if not isinstance(source, Source):
             raise TypeError("the plan's source is not a Source")
-        with named(self.plan.source):
+        with named(self.plan.source, "files"):
             self.report.manifest = build_manifest(self.plan)
         with ExitStack() as stack:
             with interruptible_opening(source, self.stop):
@@ -126,7 +126,7 @@ class _Runner:
         """Return what the sinks are told, now that the source is open."""
         on_error = self.plan.on_error or ("fail" if self.plan.replay() else "skip")
         self.tolerance = self.plan.max_failures if on_error == "skip" else 1
-        with named(self.plan.source):
+        with named(self.plan.source, "describe"):
             device = self.report.device = plain(source.describe())
             manifest = {**self.report.manifest, **({"device": device} if device else {})}
             name, read = recording_of(self.plan.source), lambda: self.reader.box.accepted
@@ -141,7 +141,7 @@ class _Runner:
             try:
                 plugin.finish(self.report.summary())
             except Exception as error:
-                failed = failure(feeder.node, None, error)
+                failed = failure(feeder.node, None, error, "finish")
                 self.report.error = self.report.error or failed
                 logger.warning("%s", failed)
 
@@ -242,7 +242,7 @@ class _Runner:
         """Stop the threads, let the sinks finish what they were handed, and settle the counts."""
         self.reader.stop.set()
         self.reader.box.close()
-        self._ask(source.interrupt)
+        self._ask(source, "interrupt")
         for feeder in self.feeders:
             feeder.box.close()
         for edge in (self.reader, *self.feeders):
@@ -252,7 +252,7 @@ class _Runner:
         self._count_read()
         self.report.waiting = self.reader.box.waiting + self.late
         self.report.elapsed_s = time.monotonic() - self.started
-        self.report.source = self._ask(source.counts) or {}
+        self.report.source = self._ask(source, "counts") or {}
         for feeder in self.feeders:
             self.report.sinks[feeder.node.name] = feeder.report()
             if feeder.error is not None:
@@ -268,11 +268,11 @@ class _Runner:
             text = f"source '{self.plan.source.use}' gave no frame: there is nothing to run on"
             self.report.error = InputError(text)
 
-    def _ask(self, method: Callable[[], Any]) -> Any:
+    def _ask(self, source: Source, method: str) -> Any:
         """Call a method of the source; where that fails, the sinks still get to their end."""
         try:
-            with named(self.plan.source):
-                return plain(method())
+            with named(self.plan.source, method):
+                return plain(getattr(source, method)())
         except MushpipeError as error:
             self.report.error = self.report.error or error
 

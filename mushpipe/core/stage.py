@@ -102,8 +102,12 @@ class Source(Plugin):
         return False
 
     def name(self) -> str:
-        """Return a short name for file names."""
-        return type(self).__name__.lower()
+        """Return a short name for file names: of the file or folder it reads, else of its class."""
+        paths = [*self.path_settings(written=False).values()]
+        if len(paths) != 1:
+            return type(self).__name__.lower()
+        path = paths[0].absolute()
+        return path.name if path.is_dir() else path.stem
 
     def files(self) -> tuple[Path, ...]:
         """Return the recordings it reads, for the manifest."""
@@ -171,4 +175,5 @@ def kind_of(plugin: type) -> Kind:
     for base, kind in kinds:
         if isinstance(plugin, type) and issubclass(plugin, base):
             return kind
-    raise PluginError(f"{plugin!r} is not a Stage, Source or Sink class")
+    name = plugin.__qualname__ if isinstance(plugin, type) else repr(plugin)
+    raise PluginError(f"{name} is not a Stage, Source or Sink class")

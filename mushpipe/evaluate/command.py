@@ -227,7 +227,8 @@ def _judge_graph(
         report = runner(plan)
         require_results(report)
         if report.error is not None:
-            logger.warning("%s: %s", option.label or graph, report.error)
+            again = f"'mushpipe run {graph}' with its recording and settings keeps the frame"
+            logger.warning("%s: %s; %s", option.label or graph, report.error, again)
         worst = worst or report.exit_code
         judged = _judge(request, result_path(plan), truths[number], *played[number])
         evaluations[option.label].recordings.append(judged)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from mushpipe.evaluate.truth import Place, TruthSet, has_truth, read_truth
 from mushpipe.traces import source_recording
 
 OPTICAL = "the camera's optical frame"  # of labels that name none
+_ROUNDED_NS = 1_000_000  # nearer than frames of any camera are to each other
 
 
 @dataclass(frozen=True)
@@ -142,6 +144,7 @@ def judge_results(
             f"{truth.name} labels frames by their number, and the frames of {results.path} are "
             f"counted from {start} s on: label them by 'stamp_ns', or run the whole recording"
         )
+    _require_exact(results, truth)
     _judge_frames(judged, rules)
     if not all(map(comparable, judged.verdicts)):
         judged.notes.append("truth and results are in different frames: 3D errors are unknown")
@@ -164,6 +167,20 @@ def judge_results(
         )
     judged.verdicts.sort(key=lambda verdict: verdict.place)
     return judged
+
+
+def _require_exact(results: Results, truth: TruthSet) -> None:
+    """Raise InputError where a label lies beside a frame, and not on it."""
+    stamps = sorted(header.stamp_ns for header, _ in results.frames)
+    for kind, stamp in truth.frames if truth.recording is None else ():
+        at = bisect_left(stamps, stamp)
+        apart = min((abs(other - stamp) for other in stamps[max(at - 1, 0) : at + 1]), default=0)
+        if kind == "stamp_ns" and 0 < apart <= _ROUNDED_NS:
+            raise InputError(
+                f"{truth.name}: no frame has the stamp_ns {stamp}, but one is {apart} ns from it: "
+                "programs that keep numbers as floating point round stamps; write all digits, or "
+                "label frames by 'index'"
+            )
 
 
 def _judge_frames(judged: Judged, rules: Rules) -> None:

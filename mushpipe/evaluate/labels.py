@@ -49,6 +49,13 @@ class Cap(Circle):
     diameter_m: float | None = Field(None, gt=0)
     diameter_max_m: float | None = Field(None, gt=0)
 
+    @field_validator("diameter_m", "diameter_max_m")
+    @classmethod
+    def _in_metres(cls, diameter: float | None) -> float | None:
+        if diameter is not None and diameter >= 1:
+            raise ValueError(f"a cap of {diameter:g} m: are lengths in metres?")
+        return diameter
+
     @field_validator("axis")
     @classmethod
     def _direction(cls, axis: list[float] | None) -> list[float] | None:

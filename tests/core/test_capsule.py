@@ -72,7 +72,8 @@ def test_the_program_repeats_the_failure(lab: Lab, graph: str, monkeypatch, caps
     assert cli(monkeypatch, "run", "failures/failure-rich-b-2.mcap") == 1
     error = first[first.index("error: ") :]
     assert capsys.readouterr().err.endswith(error)
-    assert len([*(lab.folder / "failures").iterdir()]) == 1
+    names = ["failure-rich-b-2.mcap", "failure-rich-b-2.run.json"]  # the capsule and its run
+    assert sorted(path.name for path in (lab.folder / "failures").iterdir()) == names
 
 
 def test_of_a_failure_that_does_not_come_again_the_program_says_so(
@@ -177,6 +178,28 @@ def test_a_failing_sink_stays_in_its_capsule(lab: Lab, graph: str):
     document = capsule_document(lab.folder / "failure-rich-out-0.mcap")
     assert document.data["sinks"] == {"out": {"use": "full"}}
     assert str(again(lab, first.capsules[0]).error) == str(first.error)
+
+
+def test_of_a_sink_that_fails_again_the_program_does_not_say_that_it_does_not(
+    lab: Lab, graph: str, monkeypatch, capsys
+):
+    class Full(Sink):
+        def consume(self, frame: RgbdFrame) -> None:
+            raise OSError("disk full")
+
+    lab.registry.sink("full", Full)
+    monkeypatch.chdir(lab.folder)
+    monkeypatch.setattr("mushpipe.core.plugins.load_registry", lambda: lab.registry)
+    Path("graph.yaml").write_text(graph.replace("own-b", "fussy").replace("collect", "full"))
+    assert cli(monkeypatch, "run", "graph.yaml") == 1
+    (capsule,) = Path("failures").iterdir()
+    Path("run.json").unlink()
+    capsys.readouterr()
+    assert cli(monkeypatch, "run", str(capsule)) == 1
+    error = capsys.readouterr().err
+    assert "disk full" in error
+    assert "does not fail again" not in error
+    assert not Path("run.json").exists()
 
 
 def test_the_sink_of_a_capsule_writes_beside_it(lab: Lab, graph: str):

@@ -32,7 +32,7 @@ def test_what_failed_to_open_is_closed_too_and_nothing_runs(lab: Lab, where, cal
     seen: list[str] = []
     report = lab.run(recorded(lab, seen, f"open {where}"))
     assert seen == calls
-    assert str(report.error).endswith(f"failed: OSError: open {where}")
+    assert str(report.error).endswith(f"failed in open(): OSError: open {where} (-v says where)")
     assert (report.exit_code, report.processed) == (1, 0)
 
 
@@ -60,13 +60,13 @@ def test_a_close_that_fails_stops_no_other(lab: Lab, where):
     seen: list[str] = []
     report = lab.run(recorded(lab, seen, f"close {where}"))
     assert seen[-3:] == ["close sink", "close stage", "close source"]
-    assert str(report.error).endswith(f"failed: OSError: close {where}")
+    assert str(report.error).endswith(f"failed in close(): OSError: close {where} (-v says where)")
     assert (report.exit_code, report.processed) == (1, 3)
 
 
 def test_a_sink_that_fails_to_finish(lab: Lab):
     report = lab.run(recorded(lab, [], "finish sink"))
-    assert str(report.error) == "sink 'out' (rec-sink) failed: OSError: finish sink"
+    assert str(report.error) == "sink 'out' (rec-sink) failed in finish(): OSError: finish sink"
 
 
 def recorded(lab: Lab, calls: list[str], fails: str = "") -> str:
@@ -195,7 +195,7 @@ def test_a_source_that_cannot_describe_itself(lab: Lab, method):
 
     lab.registry.source("vague", type("Vague", (Frames,), {method: fails}))
     report = lab.run(lab.chain("threshold", source="vague"))
-    assert str(report.error) == "source 'source' (vague) failed: OSError: no idea"
+    assert str(report.error) == f"source 'source' (vague) failed in {method}(): OSError: no idea"
 
 
 def test_what_a_source_lost_is_reported(lab: Lab):

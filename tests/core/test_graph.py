@@ -338,6 +338,26 @@ def test_sinks_may_share_what_is_no_file_of_theirs(lab: Lab):
     """)
 
 
+def test_a_fault_of_a_plugin_that_the_command_line_chose_says_so(lab: Lab):
+    class Needy(Stage):
+        size: int
+
+        def process(self, frame: RgbdFrame) -> Mask:
+            raise NotImplementedError
+
+    lab.registry.stage("needy", Needy)
+    faults = lab.faults(lab.chain("threshold"), "a.use=needy")
+    assert "setting 'size' of 'needy' is missing (with --set a.use=needy)" in faults
+
+    class Blind(Stage):
+        def process(self, frame: np.ndarray) -> Mask:
+            raise NotImplementedError
+
+    lab.registry.stage("blind", Blind)
+    faults = lab.faults(lab.chain("threshold"), "a.use=blind")
+    assert "produces the ndarray of its 'frame' (with --set a.use=blind)" in faults
+
+
 def test_a_missing_setting_is_placed_at_its_plugin(lab: Lab):
     class Needy(Sink):
         size: int

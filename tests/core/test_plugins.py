@@ -114,6 +114,7 @@ def test_a_broken_package_stops_no_other_and_is_quoted(site, code, reason):
     (broken,) = registry.broken
     assert (broken.name, broken.distribution, broken.version) == ("plugins", "fungus", "1.2")
     assert broken.reason.startswith(reason)
+    assert ("; expected mushpipe_register" in broken.reason) is ("unknown hook" in reason)
     assert find(registry, "first")
     assert find(registry, "last")
     with pytest.raises(PluginError) as caught:
@@ -121,6 +122,15 @@ def test_a_broken_package_stops_no_other_and_is_quoted(site, code, reason):
     assert str(caught.value).endswith(
         f"\n    it may belong to fungus 1.2, which failed to load: {broken.reason}"
     )
+
+
+def test_an_entry_point_that_names_the_function_is_told_to_name_the_module(site):
+    install(site, "fungus", GOOD)
+    (file,) = site.glob("fungus-*/entry_points.txt")
+    file.write_text(f"{file.read_text().strip()}:mushpipe_register\n")
+    (broken,) = load_registry().broken
+    cure = "its entry point must name the module, fungus, not fungus:mushpipe_register"
+    assert broken.reason.startswith(f"PluginError: it registers nothing: {cure}")
 
 
 def test_the_program_quotes_a_broken_package_where_a_graph_asks_for_its_name(
@@ -252,7 +262,7 @@ def test_an_entry_point_without_a_distribution():
     [
         ("no_such.module:X", "cannot be imported: ModuleNotFoundError: No module named 'no_such'"),
         ("mushpipe.builtin:X", "cannot be imported: AttributeError: module 'mushpipe.builtin' has"),
-        ("mushpipe.builtin:Registry", "<class 'mushpipe.core.plugins.Registry'> is not a Stage"),
+        ("mushpipe.builtin:Registry", "Registry is not a Stage"),
         ("mushpipe.builtin:hookimpl", "is not a Stage, Source or Sink class"),
         (Frames, "stage 'x' of this process is a source, not a stage"),
     ],
@@ -314,7 +324,7 @@ def test_a_file_is_loaded_once_so_that_its_types_agree(lab: Lab):
         ("1 / 0", "mine.py:X", "{file} cannot be imported: ZeroDivisionError: division by zero"),
         ("exit(3)", "mine.py:X", "{file} cannot be imported: SystemExit: 3"),
         ("X = 5", "mine.py:X", "5 is not a Stage, Source or Sink class"),
-        (FILE, "mine.py:Mask", "<class 'mushpipe.core.types.Mask'> is not a Stage, Source or Sink"),
+        (FILE, "mine.py:Mask", "Mask is not a Stage, Source or Sink"),
     ],
 )
 def test_a_file_that_cannot_be_used(lab: Lab, code, use, message):

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mushpipe import RunInfo, Sink, Trace
+from mushpipe import GraphPath, RunInfo, Sink, Trace
 from mushpipe.console import execute
 from mushpipe.core.errors import InputError, PluginError, StageError
 from mushpipe.core.manifest import build_manifest, manifest_path
@@ -208,6 +208,27 @@ def test_a_source_has_a_name_and_no_files_unless_it_says_so():
     assert (source.name(), source.files(), source.counts()) == ("frames", (), {})
 
 
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [
+        ({"path": "beds/row-7.npz"}, "row-7"),
+        ({"path": "beds/row.7"}, "row.7"),
+        ({"path": "beds/row-7", "mask": "mask.png"}, "two"),
+        ({}, "two"),
+    ],
+)
+def test_a_source_is_named_by_the_only_file_or_folder_that_it_reads(
+    tmp_path: Path, given: dict[str, str], name: str
+):
+    class Two(Frames):
+        path: GraphPath | None = None
+        mask: Path | None = None
+
+    (tmp_path / "beds" / "row.7").mkdir(parents=True)
+    paths = {key: tmp_path / value for key, value in given.items()}
+    assert Two.model_validate(paths).name() == name
+
+
 def test_a_sink_that_names_no_tuple_of_files_is_told_of(lab: Lab, graph: str):
     lab.registry.sink("one", OnePath)
     with pytest.raises(PluginError) as caught:
@@ -237,7 +258,7 @@ def test_a_source_that_does_not_name_what_it_plays_is_told_of(lab: Lab, graph: s
         manifest_path(plan)
     assert str(execute(plan, None, None).error) == text
     plan = lab.compile(graph.replace("recorded", "unmounted"))
-    text = "source 'source' (unmounted) failed: OSError: not mounted"
+    text = "source 'source' (unmounted) failed in name(): OSError: not mounted"
     with pytest.raises(StageError, match=re.escape(text)):
         manifest_path(plan)
     assert str(execute(plan, None, None).error) == text
@@ -248,5 +269,7 @@ def test_a_source_that_cannot_name_its_files_is_told_of(lab: Lab, graph: str, ca
     lab.registry.source("unmounted", NoPaths)
     with pytest.raises(StageError) as caught:
         execute(lab.compile(graph.replace("recorded", "unmounted")), None, None)
-    assert str(caught.value) == "source 'source' (unmounted) failed: OSError: not mounted"
+    assert (
+        str(caught.value) == "source 'source' (unmounted) failed in files(): OSError: not mounted"
+    )
     assert "where source 'source' failed" in caplog.text

@@ -109,7 +109,7 @@ sinks:
 """)
     plan = compile_document(read_document(tmp_path / "graph.yaml"), load_registry())
     assert run(plan).error is None
-    assert (tmp_path / "pictures.txt").read_text() == "0,1\n1,1\n"
+    assert (tmp_path / "shots.txt").read_text() == "0,1\n1,1\n"
     mine = runpy.run_path(str(tmp_path / "mine.py"))
     assert len(mine["circles"]) > 1
     (first, _) = mine["rows"](tmp_path / "log.mcap", "/mushpipe/ripe")

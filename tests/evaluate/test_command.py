@@ -190,6 +190,21 @@ def test_labels_judge_the_frames_they_name(tmp_path: Path, truths: dict[int, Any
     assert isinstance(run(results, "--truth", labels).exception, InputError)
 
 
+@pytest.mark.parametrize("away", [-128, 1, 999_999])
+def test_stamps_that_were_rounded_are_no_other_frames(
+    tmp_path: Path, truths: dict[int, Any], away: int
+) -> None:
+    results = write_results(tmp_path / "r.mcap", {i: picks_of(t) for i, t in truths.items()})
+    labels, stamp = tmp_path / "labels.json", header(1).stamp_ns + away
+    labels.write_text(
+        json.dumps({"mushpipe_labels": 1, "frames": [{"stamp_ns": stamp, "caps": []}]})
+    )
+    text = f"labels.json: no frame has the stamp_ns {stamp}, but one is {abs(away)} ns from it"
+    error = run(results, "--truth", labels).exception
+    assert isinstance(error, InputError)
+    assert text in str(error)
+
+
 def test_a_frame_labelled_by_stamp_and_by_number_is_refused(
     tmp_path: Path, truths: dict[int, Any]
 ) -> None:

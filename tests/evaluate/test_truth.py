@@ -129,6 +129,18 @@ def test_conversion_leaves_the_own_format_alone() -> None:
         (
             {
                 "mushpipe_labels": 1,
+                "frames": [
+                    {
+                        "index": 0,
+                        "caps": [{"u": 1, "v": 1, "radius_px": 9, "diameter_m": 41}],
+                    }
+                ],
+            },
+            "caps.0.diameter_m: a cap of 41 m: are lengths in metres?",
+        ),
+        (
+            {
+                "mushpipe_labels": 1,
                 "frames": [{"index": 0, "caps": [{"u": 1, "v": 1, "radius_px": -1}]}],
             },
             "radius_px",
