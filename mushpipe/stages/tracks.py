@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from mushpipe.stages.pairs import assigned, distances
 
 GATE = 0.5  # farthest that a mushroom may be from where it is expected, in radii
 NEAR = 0.4  # gates, root mean square; of those that come there by chance it is 0.7
+CHANCE = 0.01  # that so few as one, two or three come as near by chance
 FEWEST = 3  # mushrooms that must agree on a shift
 PAUSE_NS = 10**9  # between two pictures; where it is longer, anything may have been moved meanwhile
 
@@ -81,7 +83,8 @@ class Tracks:
         old, flat = _moved(self._known, new, image)
         deep = _deep(new, old)
         rows, columns = _assign(np.where(np.isfinite(deep), deep, flat), _resized(new, old))
-        if _by_chance(flat[rows, columns], len(new)):
+        latest = old.seen_ns[columns] == old.seen_ns.max(initial=0)
+        if 2 * latest.sum() < len(new) and _by_chance(flat[rows, columns]):
             rows = columns = rows[:0]
         ids = new.id.copy()
         ids[rows] = old.id[columns]
@@ -131,18 +134,21 @@ def _assign(apart: Floats, resized: Floats) -> tuple[Rows, Rows]:
     return rows, columns[rows]
 
 
-def _by_chance(found: Floats, number: int) -> bool:
+def _by_chance(found: Floats) -> bool:
     """Return whether old mushrooms meet new ones only as any two beds would.
 
-    Under a camera that turned, a tenth of a dense bed does, and up to a quarter: the ids, and what
-    robots said of them, would go to mushrooms that nobody meant. The few that an arm leaves in view
-    are where they were.
+    Under a camera that turned, a tenth of a dense bed does, and up to a quarter; where those of many
+    views are remembered, all do. The ids, and what robots said of them, would go to mushrooms that
+    nobody meant. The few that an arm leaves in view are where they were.
 
     Args:
-        found: How far those that were found again are from where they are expected, in gates.
-        number: Of all new ones.
+        found: (K,) how far those that were found again are from where they are expected, in gates.
     """
-    return 0 < 2 * len(found) < number and bool(np.mean(found**2) > NEAR**2)
+    if not (k := len(found)):
+        return False
+    # By chance a square is uniform in 0..1, and the sum of k below s with probability s^k / k!.
+    few = (CHANCE * math.factorial(k)) ** (1 / k) if k <= 3 else np.inf
+    return bool(np.sum(found**2) > min(few, k * NEAR**2))
 
 
 def _moved(old: Sightings, new: Sightings, image: tuple[int, int]) -> tuple[Sightings, Floats]:

@@ -211,6 +211,45 @@ def test_after_a_turn_no_mushroom_gets_the_id_of_another(degrees: float, z: floa
         assert found[2] == found[1]
 
 
+def bed(rng: np.random.Generator, number: int, radius: float) -> list[tuple[float, float, float]]:
+    """Return up to that many mushrooms anywhere in view, none above another."""
+    places: list[np.ndarray] = []
+    for place in rng.uniform((radius, radius), (640 - radius, 480 - radius), (2000, 2)):
+        if all(np.hypot(*(place - other)) > 1.9 * radius for other in places):
+            places.append(place)
+    return [(u, v, rng.uniform(0.44, 0.46)) for u, v in places[:number]]
+
+
+@pytest.mark.parametrize("radius", [24.0, 40.0])
+@pytest.mark.parametrize("number", [4, 8, 15, 25])
+def test_after_a_jump_to_another_bed_hardly_ever_an_id_is_kept(radius: float, number: int) -> None:
+    kept = 0
+    for seed in range(100):
+        rng, tracks = np.random.default_rng([seed, number]), Tracks()
+        views = [seen(*bed(rng, number, radius), radius=radius) for _ in range(2)]
+        first, second = (
+            set(tracks.update(*view, (640, 480), at, 10**9).tolist())
+            for at, view in enumerate(views)
+        )
+        kept += bool(first & second)
+    assert kept <= 5
+
+
+@pytest.mark.parametrize("memory_s", [1, 60])
+def test_beds_seen_one_after_the_other_keep_none_of_their_ids_however_long_the_memory(
+    memory_s: int,
+) -> None:
+    kept = total = 0
+    for seed in range(5):
+        rng, tracks, known = np.random.default_rng(seed), Tracks(), set[int]()
+        for stretch in range(12):
+            view = seen(*bed(rng, 20, 40.0), radius=40.0)
+            now = tracks.update(*view, (640, 480), stretch * 10**9, memory_s * 10**9).tolist()
+            kept, total = kept + len(known & set(now)), total + len(now)
+            known |= set(now)
+    assert kept <= 0.01 * total
+
+
 def test_the_few_that_an_arm_leaves_in_view_keep_their_ids_whatever_is_found_on_it() -> None:
     bed = dense(1) + np.array([320, 240])
     left = bed[bed[:, 0] < np.sort(bed[:, 0])[4]]
