@@ -137,9 +137,9 @@ def _assign(apart: Floats, resized: Floats) -> tuple[Rows, Rows]:
 def _by_chance(found: Floats) -> bool:
     """Return whether old mushrooms meet new ones only as any two beds would.
 
-    Under a camera that turned, a tenth of a dense bed does, and up to a quarter; where those of many
-    views are remembered, all do. The ids, and what robots said of them, would go to mushrooms that
-    nobody meant. The few that an arm leaves in view are where they were.
+    Under a camera that turned, a tenth of a dense bed does, and up to a quarter; where those of
+    many views are remembered, all do. The ids, and what robots said of them, would go to mushrooms
+    that nobody meant. The few that an arm leaves in view are where they were.
 
     Args:
         found: (K,) how far those that were found again are from where they are expected, in gates.
@@ -159,7 +159,7 @@ def _moved(old: Sightings, new: Sightings, image: tuple[int, int]) -> tuple[Sigh
     ones. In a row of caps that is one pitch, where one end is picked and the other comes to light.
     """
     flat = _flat(new, old)
-    stayed = (flat <= 1).any(axis=0).sum()
+    stayed = (flat < 0.999).any(axis=0).sum()  # at the very gate, rounding would decide
     fewer = min(len(new), len(old))
     if fewer < FEWEST or _at_rest(new, old):
         return old, flat
