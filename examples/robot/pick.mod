@@ -9,6 +9,7 @@ MODULE MushroomPicker
     CONST num MAX_AGE_MS := 200;
     CONST num VALID_S := 0.5;   ! from the image to the moment of setting off
     VAR socketdev vision;
+    VAR string picked := "";   ! what the server has not been told yet
 
     PROC main()
         Connect;
@@ -33,6 +34,11 @@ MODULE MushroomPicker
         IF answer <> "HELLO,1,LIVE" THEN
             TPWrite "vision: " + answer;
             Stop;
+        ENDIF
+        ! Under the same name this robot still holds what it had accepted.
+        IF picked <> "" THEN
+            answer := Ask("ACK," + picked + ",DONE");
+            picked := "";
         ENDIF
     ENDPROC
 
@@ -115,6 +121,9 @@ MODULE MushroomPicker
         MoveL cap, v50, fine, tool_cup \WObj:=wobj_bed;
         ! ... grip and twist ...
         MoveL RelTool(cap, 0, 0, -80), v50, fine, tool_cup \WObj:=wobj_bed;
+        ! Where the moves took more than 10 s, the server has hung up, and Connect says it again.
+        picked := id;
         line := Ask("ACK," + id + ",DONE");
+        picked := "";
     ENDPROC
 ENDMODULE

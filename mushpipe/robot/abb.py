@@ -120,9 +120,14 @@ class AbbSession:
         return None
 
     def refuse(self, refusal: Refusal, now: float) -> Outgoing:
-        """Return ``E,CODE`` or ``E,STALE,STATE``; a fatal refusal ends the connection."""
+        """Return ``E,CODE`` or ``E,STALE,STATE``; a fatal refusal ends the connection.
+
+        Nobody asked when time is up: a line would be taken for the answer to the next one.
+        """
         del now
         self.closing = self.closing or refusal.fatal
+        if refusal.code == "timeout":
+            return Outgoing(b"")
         words = ["E", refusal.code.upper(), str(refusal.extra.get("state", "")).upper()]
         return Outgoing(",".join(word for word in words if word).encode("ascii") + b"\n")
 

@@ -238,7 +238,8 @@ class Connection:
 
     def _refuse(self, text: str, now: float) -> None:
         line = self.session.refuse(Refusal("timeout", text, fatal=True), now)
-        self._send(line, now)
+        if line.data:
+            self._send(line, now)
         self._pump()
 
     def _finish(self, now: float) -> None:

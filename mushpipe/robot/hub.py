@@ -15,6 +15,7 @@ import orjson
 from mushpipe.robot.clock import Clock
 from mushpipe.robot.ledger import Ledger, Outcome
 from mushpipe.robot.messages import CLIENT_TIMEOUT_S, HEARTBEAT_S, PROTOCOL, VERSION, Refusal, State
+from mushpipe.robot.places import Places
 from mushpipe.robot.targets import Choice, Reason, Target
 
 logger = logging.getLogger("mushpipe")
@@ -77,6 +78,7 @@ class Hub:
         self.clock = clock
         self.session = str(uuid.uuid4())
         self.ledger = Ledger(settings.claim_s)
+        self._places = Places()
         self.newest: Result | None = None
         self.ending: Ending | None = None
         self._frames_read = frames_read
@@ -109,6 +111,11 @@ class Hub:
         if count != self._read[0]:
             self._read = (count, now)
         self.ledger.settle(now)
+        self._look()
+
+    def _look(self) -> None:
+        if self.newest is not None:
+            self._places.look(self.newest.choice, self.ledger.held())
 
     def state(self, now: float) -> State:
         """Say how the pipeline is."""
@@ -184,7 +191,10 @@ class Hub:
 
     def free(self, result: Result) -> list[Target]:
         """Return the targets nobody has claimed, best first."""
-        return [t for t in result.choice.targets if not self.ledger.hides(t.id)]
+        choice = result.choice
+        self._places.look(choice, self.ledger.held())
+        unnamed = (t for t in choice.targets if not self.ledger.hides(t.id))
+        return [t for t in unnamed if not self._places.taken(t, choice.frame)]
 
     def offered(self, result: Result) -> list[Target]:
         """Return the first of them, as many as may be sent."""
@@ -220,9 +230,13 @@ class Hub:
         held = self.ledger.hides(target) and not self.ledger.put_off(target)
         if outcome == "accepted" and not held:
             self.fresh(now, self.settings.max_age_s)
-        listed = self.newest.choice.targets if self.newest else ()
-        visible = any(target == known.id for known in listed)
-        return self.ledger.apply(owner, target, outcome, hold_s, visible, now)
+        self._look()
+        choice = self.newest.choice if self.newest else Choice("", (), {})
+        known = (t for t in choice.targets if t.id == target)
+        visible = any(not self._places.taken(t, choice.frame) for t in known)
+        effect = self.ledger.apply(owner, target, outcome, hold_s, visible, now)
+        self._look()
+        return effect
 
 
 def ceil_ms(seconds: float) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Set
 from dataclasses import dataclass
 from typing import Literal
 
@@ -36,6 +37,10 @@ class Ledger:
         for key in over:
             del self._entries[key]
         self.version += bool(over)
+
+    def held(self) -> Set[int]:
+        """Return the targets that are claimed or put off."""
+        return self._entries.keys()
 
     def hides(self, target: int) -> bool:
         """Return whether a target is not to be offered to anybody."""

@@ -186,3 +186,17 @@ def test_no_line_is_too_long(
         assert number > 9999 or np.abs(place).max() >= 9.9995 or size >= 0.9995
     else:
         assert len(line) <= LONGEST
+
+
+@pytest.mark.parametrize("hello", ["HELLO,1,NAME=irb", None])
+def test_who_says_nothing_for_too_long_hears_nothing_that_could_pass_for_an_answer(
+    hello: str | None,
+) -> None:
+    with bench() as b, arm(b, hello) as robot:
+        b.publish()
+        if hello:
+            assert robot.ask("ACK,0,ACCEPTED") == "A,0,REMOVED"
+        b.advance(10.1)
+        assert robot.reader.read() == b""
+        with arm(b, "HELLO,1,NAME=irb") as again:
+            assert again.ask("ACK,0,DONE") == "A,0,REMOVED"

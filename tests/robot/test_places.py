@@ -1,0 +1,94 @@
+"""What a robot works on is offered to nobody else, also where it comes back under another id."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mushpipe.robot.hub import Hub, Settings
+from mushpipe.robot.messages import Refusal
+from mushpipe.robot.targets import Choice
+from tests.robot.scene import FakeClock, choice
+
+POSITIONS = np.array([[0.0, 0.0, 0.5], [0.06, 0.0, 0.5], [0.12, 0.0, 0.5]])
+
+
+def bed(first_id: int, shift: tuple[float, float, float] = (0, 0, 0)) -> Choice:
+    """Three mushrooms of 40 mm, 60 mm apart, with ids from the first on."""
+    return choice(3, id=np.arange(first_id, first_id + 3), position=POSITIONS + shift)
+
+
+class Scene:
+    """A hub, and what it offers."""
+
+    def __init__(self) -> None:
+        self.clock = FakeClock()
+        self.hub = Hub(Settings(), self.clock)
+
+    def show(self, what: Choice) -> list[int]:
+        result = self.hub.publish(what, 0, 0, self.clock.now)
+        return [target.id for target in self.hub.free(result)]
+
+    def say(self, robot: str, target: int, outcome: str, hold_s: float = 0) -> str:
+        return self.hub.acknowledge(robot, target, outcome, hold_s, self.clock.now)  # type: ignore[arg-type]
+
+
+def test_a_claim_outlives_the_ids_that_a_pause_ends() -> None:
+    scene = Scene()
+    assert scene.show(bed(0)) == [0, 1, 2]
+    scene.say("a", 1, "accepted")
+    assert scene.show(bed(0)) == [0, 2]
+    assert scene.show(bed(3, (0.002, -0.003, 0.001))) == [3, 5]
+    with pytest.raises(Refusal, match="m4 is neither visible"):
+        scene.say("b", 4, "accepted")
+    assert scene.say("a", 1, "failed") == "restored"
+    assert scene.show(bed(3)) == [3, 4, 5]
+    assert scene.say("b", 4, "accepted") == "removed"
+
+
+def test_nobody_is_offered_what_was_put_off_before_a_pause() -> None:
+    scene = Scene()
+    scene.show(bed(0))
+    scene.say("a", 0, "failed", hold_s=10)
+    assert scene.show(bed(3)) == [4, 5]
+    scene.clock.now += 10
+    scene.hub.tick(scene.clock.now)
+    assert scene.show(bed(3)) == [3, 4, 5]
+
+
+def test_what_stands_beside_a_claim_is_offered() -> None:
+    scene = Scene()
+    scene.show(bed(0))
+    scene.say("a", 1, "accepted")
+    # more than half a diameter away, or seen when the claim was
+    assert scene.show(bed(3, (0.021, 0, 0))) == [3, 4, 5]
+    close = choice(2, position=np.array([[0.06, 0.0, 0.5], [0.07, 0.0, 0.5]]))
+    scene = Scene()
+    scene.show(close)
+    scene.say("a", 1, "accepted")
+    assert scene.show(close) == [0]
+
+
+def test_a_claim_is_where_its_mushroom_was_last_seen() -> None:
+    scene = Scene()
+    scene.show(bed(0))
+    scene.say("a", 1, "accepted")
+    scene.show(bed(0, (0.03, 0, 0)))  # the camera moves
+    assert scene.show(bed(3, (0.03, 0, 0))) == [3, 5]
+    assert scene.show(bed(6)) == [6, 7, 8]
+
+
+def test_what_is_done_hides_nothing_that_comes_to_light_there() -> None:
+    scene = Scene()
+    scene.show(bed(0))
+    scene.say("a", 1, "accepted")
+    scene.say("a", 1, "done")
+    assert scene.show(bed(3)) == [3, 4, 5]
+
+
+def test_a_claim_in_another_frame_hides_nothing() -> None:
+    scene = Scene()
+    scene.show(bed(0))
+    scene.say("a", 1, "accepted")
+    moved = bed(3)
+    assert scene.show(Choice("robot_base", moved.targets, moved.withheld)) == [3, 4, 5]
