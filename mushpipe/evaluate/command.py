@@ -227,8 +227,9 @@ def _judge_graph(
         report = runner(plan)
         require_results(report)
         if report.error is not None:
-            again = f"'mushpipe run {graph}' with its recording and settings keeps the frame"
-            logger.warning("%s: %s; %s", option.label or graph, report.error, again)
+            again = f"; 'mushpipe run {graph}' with its recording and settings keeps the frame"
+            failed = report.failed and not option.label
+            logger.warning("%s: %s%s", option.label or graph, report.error, again * bool(failed))
         worst = worst or report.exit_code
         judged = _judge(request, result_path(plan), truths[number], *played[number])
         evaluations[option.label].recordings.append(judged)

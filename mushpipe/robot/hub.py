@@ -115,7 +115,7 @@ class Hub:
 
     def _look(self) -> None:
         if self.newest is not None:
-            self._places.look(self.newest.choice, self.ledger.held())
+            self._places.look(self.newest.choice, self.ledger.claimed())
 
     def state(self, now: float) -> State:
         """Say how the pipeline is."""
@@ -192,7 +192,7 @@ class Hub:
     def free(self, result: Result) -> list[Target]:
         """Return the targets nobody has claimed, best first."""
         choice = result.choice
-        self._places.look(choice, self.ledger.held())
+        self._places.look(choice, self.ledger.claimed())
         unnamed = (t for t in choice.targets if not self.ledger.hides(t.id))
         return [t for t in unnamed if not self._places.taken(t, choice.frame)]
 

@@ -38,9 +38,9 @@ class Ledger:
             del self._entries[key]
         self.version += bool(over)
 
-    def held(self) -> Set[int]:
-        """Return the targets that are claimed or put off."""
-        return self._entries.keys()
+    def claimed(self) -> Set[int]:
+        """Return the targets that a robot is on its way to."""
+        return {key for key, entry in self._entries.items() if entry.accepted}
 
     def hides(self, target: int) -> bool:
         """Return whether a target is not to be offered to anybody."""

@@ -46,13 +46,20 @@ def test_a_claim_outlives_the_ids_that_a_pause_ends() -> None:
     assert scene.say("b", 4, "accepted") == "removed"
 
 
-def test_nobody_is_offered_what_was_put_off_before_a_pause() -> None:
+def test_a_claim_that_lapses_hides_nothing_any_more() -> None:
     scene = Scene()
     scene.show(bed(0))
-    scene.say("a", 0, "failed", hold_s=10)
+    scene.say("a", 0, "accepted")
     assert scene.show(bed(3)) == [4, 5]
-    scene.clock.now += 10
+    scene.clock.now += 60
     scene.hub.tick(scene.clock.now)
+    assert scene.show(bed(3)) == [3, 4, 5]
+
+
+def test_what_was_put_off_hides_no_other_from_a_camera_that_moved_on() -> None:
+    scene = Scene()
+    scene.show(bed(0))
+    scene.say("a", 0, "rejected", hold_s=3600)
     assert scene.show(bed(3)) == [3, 4, 5]
 
 
