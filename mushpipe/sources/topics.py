@@ -62,11 +62,14 @@ def choose_topics(
     if color is None:
         known = (t if index.counts[t] else f"{t} without a message" for t in sorted(index.channels))
         found = ", ".join(known) or "no topics at all"
-        raise InputError(f"{path}: it holds no colour images (it holds {found}){_of_others(index)}")
+        options = " or ".join(f"--set source.color_topic={t}" for t in images if t != depth)
+        hint = f"; where one of these is colour, name it: {options}" if options else ""
+        text = f"it holds no colour images (it holds {found}){_of_others(index)}{hint}"
+        raise InputError(f"{path}: {text}")
     if not use_depth:
         depth = None
     elif depth is None:
-        depths = _depths(images)
+        depths = _depths([t for t in images if _base(t) != _base(color)])
         own = [t for t in depths if not other_camera(t, color)]
         depth = _one(path, "depth", own or depths)
         if depth and other_camera(depth, color):

@@ -382,3 +382,15 @@ def test_topics_without_a_message_are_told_apart(tmp_path: Path) -> None:
         writer.finish()
     with pytest.raises(InputError, match=rf"no colour images \(it holds {COLOR} without a message"):
         play(path)
+
+
+def test_images_whose_name_says_depth_may_be_named_as_colour(tmp_path: Path) -> None:
+    topic = "/depth_camera/image_raw"
+    entries = [color_at(0, topic=topic), depth_at(0, topic="/depth_camera/depth/image_raw")]
+    other = "/depth_camera/depth/image_raw"
+    options = f"--set source.color_topic={other} or --set source.color_topic={topic}"
+    text = refusal(tmp_path / "a", entries)
+    assert text.endswith(f"; where one of these is colour, name it: {options}")
+    frame = first(tmp_path / "b", entries, color_topic=topic)
+    np.testing.assert_array_equal(frame.color, color_pixels(0))
+    np.testing.assert_array_equal(frame.depth, depth_pixels(0))
