@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,7 +15,6 @@ from mushpipe.evaluate.truth import Place, TruthSet, has_truth, read_truth
 from mushpipe.traces import source_recording
 
 OPTICAL = "the camera's optical frame"  # of labels that name none
-_ROUNDED_NS = 1_000_000  # nearer than frames of any camera are to each other
 
 
 @dataclass(frozen=True)
@@ -170,17 +168,22 @@ def judge_results(
 
 
 def _require_exact(results: Results, truth: TruthSet) -> None:
-    """Raise InputError where a label lies beside a frame, and not on it."""
-    stamps = sorted(header.stamp_ns for header, _ in results.frames)
-    for kind, stamp in truth.frames if truth.recording is None else ():
-        at = bisect_left(stamps, stamp)
-        apart = min((abs(other - stamp) for other in stamps[max(at - 1, 0) : at + 1]), default=0)
-        if kind == "stamp_ns" and 0 < apart <= _ROUNDED_NS:
+    """Raise InputError where a label has the stamp of a frame as another program rounded it."""
+    stamps = {header.stamp_ns for header, _ in results.frames}
+    rounded = {value: stamp for stamp in stamps for value in _rounded(stamp)}
+    for kind, value in truth.frames if truth.recording is None else ():
+        if kind == "stamp_ns" and value in rounded.keys() - stamps:
             raise InputError(
-                f"{truth.name}: no frame has the stamp_ns {stamp}, but one is {apart} ns from it: "
-                "programs that keep numbers as floating point round stamps; write all digits, or "
-                "label frames by 'index'"
+                f"{truth.name}: no frame has the stamp_ns {value}: it is {rounded[value]}, rounded "
+                "as by programs that keep numbers as floating point or in milliseconds; write all "
+                "digits, or label frames by 'index'"
             )
+
+
+def _rounded(stamp_ns: int) -> set[int]:
+    """Return what a stamp becomes as a float of 64 bits, or in whole micro- or milliseconds."""
+    halves = {(stamp_ns + half) // unit * unit for unit, half in ((1000, 500), (10**6, 500_000))}
+    return {int(float(stamp_ns)), stamp_ns // 1000 * 1000, stamp_ns // 10**6 * 10**6} | halves
 
 
 def _judge_frames(judged: Judged, rules: Rules) -> None:

@@ -190,19 +190,34 @@ def test_labels_judge_the_frames_they_name(tmp_path: Path, truths: dict[int, Any
     assert isinstance(run(results, "--truth", labels).exception, InputError)
 
 
-@pytest.mark.parametrize("away", [-128, 1, 999_999])
+@pytest.mark.parametrize(
+    "rounded",
+    [
+        lambda stamp: int(np.float64(stamp)),
+        lambda stamp: round(stamp / 1000) * 1000,
+        lambda stamp: stamp // 10**6 * 10**6,
+    ],
+    ids=["float", "us", "ms"],
+)
 def test_stamps_that_were_rounded_are_no_other_frames(
-    tmp_path: Path, truths: dict[int, Any], away: int
+    tmp_path: Path, truths: dict[int, Any], rounded: Any
 ) -> None:
-    results = write_results(tmp_path / "r.mcap", {i: picks_of(t) for i, t in truths.items()})
-    labels, stamp = tmp_path / "labels.json", header(1).stamp_ns + away
-    labels.write_text(
-        json.dumps({"mushpipe_labels": 1, "frames": [{"stamp_ns": stamp, "caps": []}]})
-    )
-    text = f"labels.json: no frame has the stamp_ns {stamp}, but one is {abs(away)} ns from it"
-    error = run(results, "--truth", labels).exception
-    assert isinstance(error, InputError)
-    assert text in str(error)
+    stamp = 1_700_000_000_033_456_789
+    results = tmp_path / "r.mcap"
+    writer = RecordingWriter(results, {})
+    at = replace(header(1), stamp_ns=stamp, arrival_ns=stamp)
+    writer.value("/mushpipe/pick", picks_of(truths[1]), at)
+    writer.close()
+    labels, wrong = tmp_path / "labels.json", int(rounded(stamp))
+    for written in (wrong, wrong + 7):  # the second is that of another camera, say
+        frames = [{"stamp_ns": written, "caps": []}, {"stamp_ns": stamp, "caps": []}]
+        labels.write_text(json.dumps({"mushpipe_labels": 1, "frames": frames}))
+        error = run(results, "--truth", labels).exception
+        if written == wrong:
+            assert isinstance(error, InputError)
+            assert f"labels.json: no frame has the stamp_ns {wrong}: it is {stamp}" in str(error)
+        else:
+            assert not isinstance(error, InputError)
 
 
 def test_a_frame_labelled_by_stamp_and_by_number_is_refused(
