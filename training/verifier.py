@@ -169,7 +169,7 @@ def samples(stage: PhaseHough, cases: Iterable[Prepared], deep: bool) -> tuple[F
         found = stage.gather(replace(frame), mask, learned)  # what a frame caches takes room
         if found is None or not len(found.shapes):
             continue
-        order, chance, _ = stage.decide(found)
+        order, chance, *_ = stage.decide(found)
         circles = Circles(found.shapes[:, :2], equal_area_radius(found.shapes), chance)
         label = labels(case, circles, order)
         use = np.isfinite(label) & (np.isfinite(found.middle) == deep)

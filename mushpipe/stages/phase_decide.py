@@ -2,7 +2,8 @@
 
 The candidate with the largest probability is accepted, and its edges are used up; of those that are
 likely, those that a network agrees with come first where it leads, for holes and errors of depth
-make rivals as probable that lie beside the cap. Its neighbours are then looked at again: another
+make rivals as probable that lie beside the cap; they may even make the cap unlikely, of which image
+and network are sure. Its neighbours are then looked at again: another
 circle on the same cap has lost its support, while one below it need no longer show the outline that
 it hides. This is the non-maximum suppression of the detector.
 """
@@ -25,6 +26,9 @@ from mushpipe.stages.verifier_net import Models, probability
 MARGIN = 1.0  # px; so far within an accepted circle an outline counts as hidden by it
 HOPELESS = 2e-5  # probability from which on nothing that is accepted later can help
 TAKEN = 2.5  # px; edges so near an accepted outline are its own
+# Depth alone is against a candidate of so much probability with it, agreement with the network and
+# probability without it.
+DOUBTED, AGREED, SURE = 0.2, 0.8, 0.9
 
 
 @borrower
@@ -104,6 +108,15 @@ def chance_beside(
 
 
 @borrower
+def _sight(row: Floats, chance: float, models: Models, which: int, scratch: Scratch) -> float:
+    """Return the probability without depth of what only depth is against, 0 of anything else."""
+    if which != 3 or not DOUBTED <= chance < LIKELY or row[AT_LEARNED] < AGREED:
+        return 0.0
+    sight = float(probability(row, models, 2, scratch.first, scratch.second))
+    return sight if sight >= SURE else 0.0
+
+
+@borrower
 def _use_up(edges: Strips, shape: Floats, number: int, owner: Ints32, scratch: Scratch) -> None:
     rows, nothing = scratch.rows, scratch.lanes[:0]
     count = gather(edges, nothing, 0.0, shape, reach_of(shape[2], NARROW), scratch)
@@ -121,7 +134,7 @@ def _use_up(edges: Strips, shape: Floats, number: int, owner: Ints32, scratch: S
 def decide(
     edges: Strips, shapes: Floats, hits: Ints32, table: Floats, which: Ints32, models: Models,
     least: float, led: bool,
-) -> tuple[Ints32, Floats, Ints32]:  # fmt: skip
+) -> tuple[Ints32, Floats, Ints32, Floats]:  # fmt: skip
     """Accept candidates in the order of their probability.
 
     Args:
@@ -136,8 +149,9 @@ def decide(
         led: Whether those that are likely come in the order of probability plus `learned`.
 
     Returns:
-        Rows of the accepted in their order, the probability of every candidate, and of every edge
-        point the number of the accepted circle that it belongs to, -1 for none.
+        Rows of the accepted in their order, the probability of every candidate, of every edge point
+        the number of the accepted circle that it belongs to, -1 for none, and the probability
+        without depth of the candidates that depth alone is against, 0 of the others.
     """
     n = len(shapes)
     owner = np.full(len(edges.x), -1, np.int32)
@@ -149,17 +163,20 @@ def decide(
         chance[k] = chance_beside(
             edges, shapes[k], hits[k], owner, near[:0], table[k], models, which[k], scratch
         )
+    sight = np.zeros(n)
+    for k in range(n if led else 0):
+        sight[k] = _sight(table[k], chance[k], models, which[k], scratch)
     for count in range(n):
         best, top = -1, 0.0
         for k in range(n):
             if waiting[k] and chance[k] >= least:
                 rank = chance[k]
-                if led and chance[k] >= LIKELY:
-                    rank += table[k, AT_LEARNED]
+                if led and (chance[k] >= LIKELY or sight[k] > 0):
+                    rank = max(chance[k], sight[k]) + table[k, AT_LEARNED]
                 if rank >= top:
                     best, top = k, rank
         if best < 0:
-            return order[:count], chance, owner
+            return order[:count], chance, owner, sight
         waiting[best], order[count] = False, best
         _use_up(edges, shapes[best], count, owner, scratch)
         # Not only what it used up: what it hides, too, changes the odds of its neighbours.
@@ -170,7 +187,7 @@ def decide(
                     edges, shapes[k], hits[k], owner, near[:met], table[k], models, which[k],
                     scratch,
                 )  # fmt: skip
-    return order, chance, owner
+    return order, chance, owner, sight
 
 
 @jit

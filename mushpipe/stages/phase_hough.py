@@ -162,11 +162,11 @@ class PhaseHough(Stage):
         if found is None:
             return Circles(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
         # Beside depth: an image alone places circles better than the network does.
-        order, chance, owner = self.decide(found, led=found.relief.known)
+        order, chance, owner, sight = self.decide(found, led=found.relief.known)
         shapes, score = found.shapes[order], chance[order]
         # What is hardly a cap changes nothing about those that are likely: it takes no edges from
         # them, and what is a cap only beside it is no more likely than it is.
-        after = np.logical_or.accumulate(score < LIKELY)
+        after = np.logical_or.accumulate((score < LIKELY) & (sight[order] == 0))
         score[after] = np.minimum.accumulate(score[after])
         owner[np.append(after, False)[owner]] = -1  # an owner of -1 stays one
         polish(found.edges, found.relief, shapes, owner, found.radii)
@@ -221,8 +221,8 @@ class PhaseHough(Stage):
         parts = (shapes[kept], hits[kept], table[kept], middle[kept])
         return Evidence(edges, *parts, relief, radii, known)
 
-    def decide(self, found: Evidence, led: bool = False) -> tuple[Ints32, Floats, Ints32]:
-        """Return the accepted rows in their order, all probabilities, and whose each edge is.
+    def decide(self, found: Evidence, led: bool = False) -> tuple[Ints32, Floats, Ints32, Floats]:
+        """Return the accepted rows in order, all probabilities, whose each edge is; see `decide`.
 
         `led` is whether the network has a say in the order of the likely ones.
         """

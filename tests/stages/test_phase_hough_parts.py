@@ -253,7 +253,8 @@ def test_every_candidate_has_all_features_and_a_probability() -> None:
     stage = PhaseHough()
     found = stage.gather(frame_of(image), Mask(image > 0.5))
     assert found is not None
-    order, chance, owner = stage.decide(found)
+    order, chance, owner, sight = stage.decide(found)
+    assert not sight.any()
     assert found.table.shape == (len(found.shapes), len(NAMES))
     assert np.isfinite(found.table).all()
     assert ((chance >= 0) & (chance <= 1)).all()
@@ -273,6 +274,33 @@ def test_of_likely_rivals_the_one_that_a_network_agrees_with_comes_first(likely:
     alike = alike._replace(scale=alike.scale + 1, b3=alike.b3 + logit)
     which = np.zeros(n, np.int32)
     parts = (found.edges, found.shapes, found.hits, found.table)
-    order, _, _ = decide(*parts, which, alike, least=0.3, led=True)
+    order, *_ = decide(*parts, which, alike, least=0.3, led=True)
     first_agreed, last_given = list(range(n)), list(range(n))[::-1]
     assert order.tolist() == (first_agreed if likely else last_given)
+
+
+@pytest.mark.parametrize("doubted", [0.1, 0.3])
+def test_what_depth_alone_is_against_comes_first_where_image_and_network_are_sure(
+    doubted: float,
+) -> None:
+    """As where a stereo camera sees the ground within a smooth cap: a part of it is likelier."""
+    image = discs([(40, 60, 15), (62, 60, 14), (90, 40, 12)], 0.8, 0.15)
+    found = PhaseHough().gather(frame_of(image), Mask(image > 0.5))
+    assert found is not None
+    n = len(found.shapes)
+    agreed = np.where(np.arange(n) < n // 2, 0.9, 0.2)
+    found.table[:, NAMES.index(LEARNED)] = agreed
+    alike = Models(*(np.zeros_like(part) for part in load_verifier()))
+    logits = np.zeros_like(alike.b3)
+    logits[2], logits[3] = np.log(0.95 / 0.05), np.log(doubted / (1 - doubted))
+    alike = alike._replace(scale=alike.scale + 1, b3=logits)
+    parts = (found.edges, found.shapes, found.hits, found.table)
+    which = np.full(n, 3, np.int32)  # all have depth, and a circle of the network
+    order, chance, _, sight = decide(*parts, which, alike, least=0.05, led=True)
+    np.testing.assert_allclose(chance, doubted, rtol=1e-5)
+    seen = doubted >= 0.2
+    np.testing.assert_allclose(sight, np.where((agreed > 0.8) & seen, 0.95, 0), rtol=1e-5)
+    first = list(range(n // 2))[::-1] if seen else []
+    assert order[: len(first)].tolist() == first
+    order, _, _, sight = decide(*parts, which, alike, least=0.05, led=False)
+    assert not sight.any()
