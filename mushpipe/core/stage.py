@@ -11,7 +11,7 @@ from pydantic import Field
 
 from mushpipe.core.errors import PluginError
 from mushpipe.core.group import Group
-from mushpipe.core.paths import STDIO, is_written
+from mushpipe.core.paths import STDIO, is_written, real
 from mushpipe.core.types import RgbdFrame
 
 Kind = Literal["stage", "source", "sink"]
@@ -106,8 +106,7 @@ class Source(Plugin):
         paths = [*self.path_settings(written=False).values()]
         if len(paths) != 1:
             return type(self).__name__.lower()
-        path = paths[0].absolute()
-        return path.name if path.is_dir() else path.stem
+        return real(paths[0]).name if paths[0].is_dir() else paths[0].stem
 
     def files(self) -> tuple[Path, ...]:
         """Return the recordings it reads, for the manifest."""

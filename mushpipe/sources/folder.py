@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from mushpipe import Header, InputError, ReplaySource, RgbdFrame, UsageError
-from mushpipe.core.paths import GraphPath, real
+from mushpipe.core.paths import GraphPath
 from mushpipe.core.types import COLOR_FRAME
 from mushpipe.sources.recorded import NO_CAMERA, NO_DEPTH, Intrinsics
 
@@ -67,10 +67,6 @@ class ImagesSource(ReplaySource):
         if self.depth is not None and self.depth_scale is None:
             raise ValueError("with depth, set depth_scale: how many metres a unit of it is")
         return self
-
-    def name(self) -> str:
-        """Return the folder's name."""
-        return real(self.path).name
 
     def files(self) -> tuple[Path, ...]:
         """Return all images."""

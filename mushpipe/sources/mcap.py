@@ -40,10 +40,6 @@ class McapSource(RecordedSource, ReplaySource):
     _counts: Counter[str] = PrivateAttr(default_factory=Counter)
     _reader: RecordingReader | None = PrivateAttr(None)
 
-    def name(self) -> str:
-        """Return the recording's file name without its suffix."""
-        return self.path.stem
-
     def files(self) -> tuple[Path, ...]:
         """Return the recording."""
         return (self.path,)
@@ -87,8 +83,7 @@ class McapSource(RecordedSource, ReplaySource):
         reader = self._reader or RecordingReader(self.path)
         index, topics = self._chosen(reader)
         numbered = MANIFEST in index.metadata or GRAPH in index.metadata
-        played = set(vars(topics).values())
-        beside = beside_of(index.channels.keys() - played) if numbered else set()
+        beside = beside_of(index.channels, topics) if numbered else set()
         if topics.depth is None:
             logger.warning(NO_DEPTH, self.path.name)
             if self.use_depth and (others := untold_images(index, topics.color)):

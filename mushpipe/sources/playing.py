@@ -254,9 +254,9 @@ class _Color:
 _Depth = tuple[str, Any, float]
 
 
-def beside_of(topics: Iterable[str]) -> set[str]:
+def beside_of(topics: Iterable[str], played: Topics) -> set[str]:
     """Return which topics are of the frames themselves, as truth and clocks, but no images."""
-    images = {wire.COLOR_TOPIC, wire.DEPTH_TOPIC, wire.CAMERA_TOPIC}
+    images = {wire.COLOR_TOPIC, wire.DEPTH_TOPIC, wire.CAMERA_TOPIC, *vars(played).values()}
     return {t for t in set(topics) - images if not t.startswith(wire.RESULT_PREFIX)}
 
 

@@ -121,8 +121,7 @@ class StreamSource(RecordedSource):
             first = replace(topics, depth=None)
             if head:
                 logger.warning(NO_DEPTH, "the stream")
-        others = reader.topics - set(vars(topics).values())
-        beside = beside_of(others) if self._manifest else set()
+        beside = beside_of(reader.topics, topics) if self._manifest else set()
         player = Player(self, "the stream", first, beside, bool(self._manifest), self._counts)
         known = _of_interest(chain(head, messages), player, topics)
         for frame in player.play(known, hold=False):
