@@ -215,9 +215,11 @@ def bed(rng: np.random.Generator, number: int, radius: float) -> list[tuple[floa
     """Return up to that many mushrooms anywhere in view, none above another."""
     places: list[np.ndarray] = []
     for place in rng.uniform((radius, radius), (640 - radius, 480 - radius), (2000, 2)):
-        if all(np.hypot(*(place - other)) > 1.9 * radius for other in places):
+        if len(places) == number:
+            break
+        if (np.linalg.norm(place - np.reshape(places, (-1, 2)), axis=1) > 1.9 * radius).all():
             places.append(place)
-    return [(u, v, rng.uniform(0.44, 0.46)) for u, v in places[:number]]
+    return [(u, v, rng.uniform(0.44, 0.46)) for u, v in places]
 
 
 @pytest.mark.parametrize("radius", [24.0, 40.0])
