@@ -21,6 +21,7 @@ from mushpipe.stages.phase_features import AT_LEARNED
 from mushpipe.stages.phase_refit import COSINES, HIDDEN, NARROW, SINES, reach_of, tolerance
 from mushpipe.stages.phase_scratch import Scratch, scratch_for
 from mushpipe.stages.phase_strips import Strips, gather
+from mushpipe.stages.phase_trust import FAINT, mixed, trust_in
 from mushpipe.stages.verifier_net import Models, probability
 
 MARGIN = 1.0  # px; so far within an accepted circle an outline counts as hidden by it
@@ -99,12 +100,35 @@ def outline_features(
 @borrower
 def chance_beside(
     edges: Strips, shape: Floats, hits: Ints32, owner: Ints32, accepted: Floats, row: Floats,
-    models: Models, which: int, scratch: Scratch,
+    models: Models, which: int, trust: float, scratch: Scratch,
 ) -> float:  # fmt: skip
     """Return the probability of a candidate beside the accepted; writes what depends on them."""
     outline_features(edges, shape, hits, owner, accepted, row, scratch)
     overlap_features(shape, accepted, row)
-    return probability(row, models, which, scratch.first, scratch.second)
+    chance = float(probability(row, models, which, scratch.first, scratch.second))
+    return _trusting(row, chance, models, which, trust, scratch)
+
+
+@borrower
+def _trusting(
+    row: Floats, chance: float, models: Models, which: int, trust: float, scratch: Scratch
+) -> float:
+    """Return a probability beside a network that is believed so far where it sees little."""
+    if which != 3 or trust >= 1 or row[AT_LEARNED] >= FAINT:
+        return chance
+    alone = float(probability(row, models, 1, scratch.first, scratch.second))
+    return mixed(chance, alone, trust)
+
+
+@borrower
+def _alone(
+    table: Floats, chance: Floats, models: Models, which: Ints32, scratch: Scratch, alone: Floats
+) -> None:
+    """Write the probabilities (N,) without a network, 0 of what has no depth."""
+    for k in range(len(alone)):
+        alone[k] = chance[k] if which[k] == 1 else 0.0
+        if which[k] == 3:
+            alone[k] = probability(table[k], models, 1, scratch.first, scratch.second)
 
 
 @borrower
@@ -146,7 +170,8 @@ def decide(
         which: (N,) the model that decides on a candidate.
         models: The models.
         least: Smallest probability that is accepted.
-        led: Whether those that are likely come in the order of probability plus `learned`.
+        led: Whether those that are likely come in the order of probability plus `learned`, and
+            the network is believed as far as it sees caps here (`phase_trust`).
 
     Returns:
         Rows of the accepted in their order, the probability of every candidate, of every edge point
@@ -161,11 +186,15 @@ def decide(
     near = np.empty((n, 5))
     for k in range(n):
         chance[k] = chance_beside(
-            edges, shapes[k], hits[k], owner, near[:0], table[k], models, which[k], scratch
+            edges, shapes[k], hits[k], owner, near[:0], table[k], models, which[k], 1.0, scratch
         )
-    sight = np.zeros(n)
-    for k in range(n if led else 0):
-        sight[k] = _sight(table[k], chance[k], models, which[k], scratch)
+    sight, trust = np.zeros(n), 1.0
+    if led:
+        _alone(table, chance, models, which, scratch, sight)
+        trust = trust_in(shapes, sight, table[:, AT_LEARNED], first, beside)
+        for k in range(n):
+            chance[k] = _trusting(table[k], chance[k], models, which[k], trust, scratch)
+            sight[k] = _sight(table[k], chance[k], models, which[k], scratch)
     for count in range(n):
         best, top = -1, 0.0
         for k in range(n):
@@ -185,7 +214,7 @@ def decide(
                 met = _accepted(shapes, waiting, beside[first[k] : first[k + 1]], near)
                 chance[k] = chance_beside(
                     edges, shapes[k], hits[k], owner, near[:met], table[k], models, which[k],
-                    scratch,
+                    trust, scratch,
                 )  # fmt: skip
     return order, chance, owner, sight
 

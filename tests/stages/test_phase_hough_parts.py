@@ -292,7 +292,7 @@ def test_what_depth_alone_is_against_comes_first_where_image_and_network_are_sur
     found.table[:, NAMES.index(LEARNED)] = agreed
     alike = Models(*(np.zeros_like(part) for part in load_verifier()))
     logits = np.zeros_like(alike.b3)
-    logits[2], logits[3] = np.log(0.95 / 0.05), np.log(doubted / (1 - doubted))
+    logits[2], logits[[1, 3]] = np.log(0.95 / 0.05), np.log(doubted / (1 - doubted))
     alike = alike._replace(scale=alike.scale + 1, b3=logits)
     parts = (found.edges, found.shapes, found.hits, found.table)
     which = np.full(n, 3, np.int32)  # all have depth, and a circle of the network
