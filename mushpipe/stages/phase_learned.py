@@ -9,8 +9,8 @@ import numpy as np
 from mushpipe import Circles
 from mushpipe.core.arrays import Bools, Bytes, Floats, Ints32, Singles
 from mushpipe.core.jit import borrower, jit
-from mushpipe.stages.cap_clod import darker, ground_of, off_ground
-from mushpipe.stages.cap_kin import tones_of
+from mushpipe.stages.cap_clod import ODD, darker, ground_of, off_ground
+from mushpipe.stages.cap_kin import FEWEST, SURE, alike, tones_of
 from mushpipe.stages.discs import (
     LEAST_OF_RANGE,
     MOST_OF_RANGE,
@@ -76,7 +76,8 @@ def without_clods(color: Bytes, circles: Circles, seen: Floats) -> Circles:
     A round clod has the form of a cap in depth as well, and looks just like the soil, as no cap
     does. Caps that the network sees nothing of are few, and do not come near to it, unless it is
     even, and what it is surest of is no clod. White caps on mycelium or a table do look like that,
-    and where the border cuts a circle too little of the ground is seen.
+    and where the border cuts a circle too little of the ground is seen. What looks like half of the
+    caps of which image, depth and network are sure, if they are several, is one of them.
 
     Args:
         color: (H, W, 3) RGB.
@@ -91,6 +92,9 @@ def without_clods(color: Bytes, circles: Circles, seen: Floats) -> Circles:
     away = off_ground(tones, ground)
     exactly = (away < _EXACTLY) & (seen < _DOUBTED)
     clod = exactly | ((seen == 0) & (away < _GROUND) & (ground[:, 3] >= _UNEVEN))
+    known = np.flatnonzero((circles.score >= SURE) & (seen >= _SAME))
+    if len(known) >= FEWEST:
+        clod &= 2 * alike(tones, known, ODD) < len(known)
     return circles.take(~(clod & darker(ground, _SOIL)))
 
 

@@ -211,3 +211,19 @@ def test_clods_look_like_dark_soil_and_nearly_so_where_the_network_sees_nothing(
     cut = Circles(found.center - (80, 0), found.radius, found.score).take([1, 3])
     color = scene(soil * grain)[:, 80:]
     assert without_clods(color, cut, np.zeros(2)).center[:, 0].tolist() == [10]
+
+
+@pytest.mark.parametrize("dirty", range(8))
+def test_what_looks_like_half_of_the_sure_caps_is_none_of_the_clods(dirty: int) -> None:
+    """Caps that soil lies on look like soil, and a network may be blind to the dirtiest."""
+    soil, white = np.array([(60, 48, 40), (190, 180, 165)])
+    found = circles(*((30 + 40 * i, 60, 12, 0.95) for i in range(8)))
+    v, u = np.mgrid[:120, :340]
+    color = soil * np.random.default_rng(0).normal(1, 0.25, (120, 340, 1))
+    for i, (x, y) in enumerate(found.center):
+        color[np.hypot(u - x, v - y) < 12] = soil if i in (*range(dirty), 7) else white
+    seen = np.append(np.full(7, 0.95), 0)  # all but the last
+    left = without_clods(color.astype(np.uint8), found, seen)
+    assert len(left) == (8 if dirty >= 4 else 7)
+    few = without_clods(color.astype(np.uint8), found.take([0, 1, 2, 7]), seen[[0, 1, 2, 7]])
+    assert len(few) == 3  # tell nothing
