@@ -73,6 +73,8 @@ def test_a_lid_is_no_cap_however_sure_the_detector_is_and_a_flat_cap_is_one() ->
         (0.55, 0.8, None, False),
         (0.95, 0.3, None, False),
         (0.55, 0.8, 0.9, True),
+        (0.55, 0.72, 0.9, True),  # a tenth darker, as another of the kind may be
+        (0.55, 0.65, 0.9, False),
         (0.55, 0.8, 0.5, False),
         (0.55, 0.3, 0.9, False),
     ],
