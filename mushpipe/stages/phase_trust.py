@@ -2,7 +2,8 @@
 
 A network knows the caps that it was trained on. On a bed of others, dirty or small or under other
 light, it misses many of which outline and depth are sure; there, that it sees little says little.
-The bed itself tells: by how many of those candidates it sees.
+The bed itself tells: by how many of those candidates it sees. A few tell nothing: where caps are
+few, cups and stones are among them, and there it is believed.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import math
 
 from mushpipe.core.arrays import Floats, Ints32
 from mushpipe.core.jit import borrower
+from mushpipe.stages.cap_kin import FEWEST
 
 SURE = 0.95  # probability without the network from which on a candidate tells
 SEEN = 0.5  # agreement from which on the network sees it
@@ -32,12 +34,15 @@ def trust_in(
         first: (N + 1,) as from `phase_decide.neighbours`.
         beside: (M,) as well.
     """
-    seen, sure = AMONG * USUAL, AMONG
+    seen = sure = 0
     for k in range(len(shapes)):
         if alone[k] >= SURE and _leads(k, shapes, alone, beside[first[k] : first[k + 1]]):
             sure += 1
             seen += agreement[k] >= SEEN
-    return min(1.0, max(0.0, (seen / sure - BLIND) / (SOUND - BLIND)))
+    if sure < FEWEST:
+        return 1.0
+    share = (AMONG * USUAL + seen) / (AMONG + sure)
+    return min(1.0, max(0.0, (share - BLIND) / (SOUND - BLIND)))
 
 
 @borrower
