@@ -3,9 +3,9 @@
 The candidate with the largest probability is accepted, and its edges are used up; of those that are
 likely, those that a network agrees with come first where it leads, for holes and errors of depth
 make rivals as probable that lie beside the cap; they may even make the cap unlikely, of which image
-and network are sure. Its neighbours are then looked at again: another
-circle on the same cap has lost its support, while one below it need no longer show the outline that
-it hides. This is the non-maximum suppression of the detector.
+and network are sure. Its neighbours are then looked at again: another circle on the same cap has
+lost its support, while one below it need no longer show the outline that it hides. This is
+the non-maximum suppression of the detector.
 """
 
 from __future__ import annotations
@@ -154,6 +154,22 @@ def _use_up(edges: Strips, shape: Floats, number: int, owner: Ints32, scratch: S
             owner[rows[k]] = number
 
 
+@borrower
+def _first_of(
+    waiting: Bools, chance: Floats, sight: Floats, table: Floats, least: float, led: bool
+) -> int:
+    """Return the row of the candidate that is accepted next, -1 where there is none."""
+    best, top = -1, 0.0
+    for k in range(len(chance)):
+        if waiting[k] and chance[k] >= least:
+            rank = chance[k]
+            if led and (chance[k] >= LIKELY or sight[k] > 0):
+                rank = max(chance[k], sight[k]) + table[k, AT_LEARNED]
+            if rank >= top:
+                best, top = k, rank
+    return best
+
+
 @jit
 def decide(
     edges: Strips, shapes: Floats, hits: Ints32, table: Floats, which: Ints32, models: Models,
@@ -196,14 +212,7 @@ def decide(
             chance[k] = _trusting(table[k], chance[k], models, which[k], trust, scratch)
             sight[k] = _sight(table[k], chance[k], models, which[k], scratch)
     for count in range(n):
-        best, top = -1, 0.0
-        for k in range(n):
-            if waiting[k] and chance[k] >= least:
-                rank = chance[k]
-                if led and (chance[k] >= LIKELY or sight[k] > 0):
-                    rank = max(chance[k], sight[k]) + table[k, AT_LEARNED]
-                if rank >= top:
-                    best, top = k, rank
+        best = _first_of(waiting, chance, sight, table, least, led)
         if best < 0:
             return order[:count], chance, owner, sight
         waiting[best], order[count] = False, best
