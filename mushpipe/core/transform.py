@@ -63,9 +63,27 @@ class Transform(Group):
         """Turn (N, 3) vectors; rows of NaN stay NaN."""
         return np.asarray(vectors @ self._matrix().T)
 
-    def spreads(self, sigmas: Floats) -> Floats:
-        """Turn (N, 3) standard deviations along x, y, z, which are taken for independent."""
-        return np.sqrt(sigmas**2 @ (self._matrix() ** 2).T)
+    def spreads(self, sigmas: Floats, points: Floats) -> Floats:
+        """Turn (N, 3) standard deviations along x, y, z of points (N, 3) that a camera measured.
+
+        Their errors lie along the unit ray r with a variance A, across it with C < A: the
+        covariance is C I + (A - C) r r^T, and z less the mean of x and y, off its diagonal and off
+        that of r r^T, gives A - C. That holds up to 54 degrees off the optical axis; beyond, and
+        where errors are no larger along the ray, they are taken for independent.
+
+        Args:
+            sigmas: In the camera's frame; rows of NaN stay NaN.
+            points: In the camera's optical frame, m.
+        """
+        rays = points / np.linalg.norm(points, axis=1, keepdims=True)
+        variances, squares = sigmas**2, rays**2
+        excess, share = (v[:, 2] - v[:, :2].mean(axis=1) for v in (variances, squares))
+        along = np.zeros(len(rays))
+        np.divide(np.maximum(excess, 0), share, out=along, where=share > 0)
+        # no axis has more of it than all its variance
+        along = np.minimum(along, (variances / np.maximum(squares, 1e-12)).min(axis=1))[:, None]
+        rest = (variances - along * squares) @ (self._matrix() ** 2).T
+        return np.asarray(np.sqrt(along * self.directions(rays) ** 2 + rest))
 
     def rotations(self, quaternions: Floats) -> Floats:
         """Turn (N, 4) orientations, x y z w; rows of NaN stay NaN."""

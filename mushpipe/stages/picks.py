@@ -292,6 +292,6 @@ def in_base(picks: Picks, transform: Transform) -> Picks:
         surface=transform.points(picks.surface),
         quaternion=transform.rotations(picks.quaternion),
         axis=transform.directions(picks.axis),
-        sigma_position=transform.spreads(picks.sigma_position),
+        sigma_position=transform.spreads(picks.sigma_position, picks.surface),
         frame_id=transform.frame,
     )

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from mushpipe.core.document import parse_document
 from mushpipe.core.errors import GraphError
@@ -55,3 +59,31 @@ def test_faults_are_reported_where_they_stand(tmp_path: Path, text: str, message
         setting(tmp_path, text)
     assert message in str(caught.value)
     assert "g.yaml:8:" in str(caught.value)
+
+
+@given(
+    angles=st.tuples(*[st.floats(-180, 180)] * 3),
+    point=st.tuples(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), st.floats(0.3, 1)),
+    along=st.floats(1e-4, 5e-3),
+    share=st.floats(0.05, 1),
+)
+def test_spreads_of_what_a_camera_measures_turn_as_its_covariance(
+    angles: tuple[float, ...], point: tuple[float, ...], along: float, share: float
+) -> None:
+    turn, ray = Rotation.from_euler("xyz", angles, degrees=True), np.array(point)
+    ray /= np.linalg.norm(ray)
+    across = along * share
+    covariance = across**2 * np.eye(3) + (along**2 - across**2) * np.outer(ray, ray)
+    turned = turn.as_matrix() @ covariance @ turn.as_matrix().T
+    x, y, z, w = turn.as_quat()
+    spreads = Transform(frame="b", translation=(0, 0, 0), quaternion=(x, y, z, w)).spreads(
+        np.sqrt(np.diag(covariance))[None], np.array([point])
+    )
+    np.testing.assert_allclose(spreads[0], np.sqrt(np.diag(turned)), rtol=1e-6)
+
+
+def test_spreads_are_independent_where_nothing_says_they_are_along_the_ray() -> None:
+    quarter = Transform(frame="b", translation=(0, 0, 0), quaternion=(0, 0, 0.5**0.5, 0.5**0.5))
+    sigmas = np.array([[0.001, 0.002, 0.001], [np.nan] * 3])
+    spreads = quarter.spreads(sigmas, np.array([[0.1, 0.1, 0.5], [np.nan] * 3]))
+    np.testing.assert_allclose(spreads, [[0.002, 0.001, 0.001], [np.nan] * 3])
