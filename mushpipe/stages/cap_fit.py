@@ -37,6 +37,7 @@ from mushpipe.stages.warm_up import example_circles, example_frame
 
 LEAST = 8  # points that a surface over a hole needs
 _SAME = 0.6  # IoU of two circles that are one cap
+_HIGHEST = 0.9  # aspect h/R: below its rim even a higher cap is no ball, and shows some tilt
 
 
 class CapFit(Stage):
@@ -237,7 +238,23 @@ def _poses(fits: Fits) -> Poses:
         quaternion=quaternion_from_axis(fits.axis),
         axis=fits.axis,
         apex=fits.apex,
-        sigma_rad=fits.sigma_tilt,
+        sigma_rad=_sigma_tilt(fits),
         fitness=fits.fitness,
         valid=fits.valid,
     )
+
+
+def _sigma_tilt(fits: Fits) -> Floats:
+    """Return the sigma (N,) of the tilt, rad, with what not knowing how high a cap is does to it.
+
+    The variance of the tilt goes by g(a) = 1 / (1 - a^2)^2 with the aspect a = h/R, for a cap as
+    high as wide shows none (docs/pose.md, "What can be seen"). The fit took its own a for the true
+    one; with the variance v of that, g is g + v g''/2 in the mean, to second order.
+    """
+    a = fits.height / fits.radius
+    radius, height = fits.covariance[:, 5, 5], fits.covariance[:, 6, 6]
+    both = fits.covariance[:, 5, 6]
+    variance = (height - 2 * a * both + a**2 * radius) / fits.radius**2
+    square = np.minimum(a, _HIGHEST) ** 2
+    growth = 4 / (1 - square) + 24 * square / (1 - square) ** 2  # g''/g
+    return np.asarray(fits.sigma_tilt * np.sqrt(1 + variance * growth / 2))

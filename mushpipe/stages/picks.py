@@ -24,8 +24,8 @@ from mushpipe.stages.tracks import Tracks
 logger = logging.getLogger("mushpipe")
 SMALLEST_MM = 1.0
 LEVEL = 0.2  # of a camera that looks level, the rise along its axis
-HEIGHT = 0.3  # of a usual cap, in diameters
-TIP = 0.04  # sigma of the top of a cap about that of its model, in heights
+SLIDE = 0.4  # diameters that the apex moves per radian that a cap leans otherwise than was found
+TIP = 0.012  # sigma of the top of a cap about that of its model, in diameters
 Rank = Literal["unoccluded", "highest", "largest", "score"]
 FlagName = Literal[
     "depth_missing",
@@ -242,15 +242,16 @@ class MakePicks(Stage):
 def _sigma_position(picks: Picks) -> Floats:
     """Return the sigma (N, 3), m, of the apex where there is a pose, of the surface point else.
 
-    The picks come with that of the surface point, in the frame in which they are given. A cap that
-    leans by an angle more than was found, about its middle, has its apex farther by that angle
-    times its height, in any direction across its axis n: the covariance is
-    (height sigma)^2 (I - n n^T) / 2, sigma being that of the whole angle. Along the axis the top of
-    a pointed or flat cap is not where that of a model is: (`TIP` height)^2 n n^T.
+    The picks come with that of the surface point, in the frame in which they are given. Where a cap
+    leans by an angle more than was found, what is seen of its dome stays where it is, so it turns
+    about the middle of that curve and the apex slides along it by that angle times SLIDE D, in any
+    direction across its axis n: the covariance is (SLIDE D sigma)^2 (I - n n^T) / 2, sigma being
+    that of the whole angle and D the diameter. Along the axis the top of a pointed or flat cap is
+    not where that of a model is: (TIP D)^2 n n^T.
     """
-    height, along = HEIGHT * picks.diameter[:, None], picks.axis**2
-    across = 0.5 * (height * picks.sigma_tilt[:, None]) ** 2 * np.maximum(1 - along, 0)
-    apex = np.sqrt(picks.sigma_position**2 + across + (TIP * height) ** 2 * along)
+    diameter, along = picks.diameter[:, None], picks.axis**2
+    slide = 0.5 * (SLIDE * diameter * picks.sigma_tilt[:, None]) ** 2 * np.maximum(1 - along, 0)
+    apex = np.sqrt(picks.sigma_position**2 + slide + (TIP * diameter) ** 2 * along)
     posed = (picks.flags & np.uint32(PickFlag.POSE_UNKNOWN)) == 0
     return np.where(posed[:, None], apex, picks.sigma_position)
 

@@ -86,12 +86,12 @@ def test_the_apex_stands_in_for_the_surface_only_where_the_pose_is_valid() -> No
 
 def test_the_sigma_of_a_position_is_that_of_the_apex_where_there_is_one() -> None:
     rng, n, sigma_deg = np.random.default_rng(0), 20000, 12.0
-    axis, height, surface = np.array([0.48, 0.0, -0.8773]), 0.012, 0.0008
+    axis, curve, surface = np.array([0.48, 0.0, -0.8773]), 0.016, 0.0008
     axis /= np.linalg.norm(axis)
     lean = rng.normal(0, np.radians(sigma_deg) / np.sqrt(2), (n, 2))  # the angle is their length
     sides = np.stack([np.cross(axis, [0, 1, 0]), [0, 1, 0]])
-    top = 1 + rng.normal(0, 0.04, n)  # of the height of a model
-    apexes = height * (top[:, None] * axis + lean @ sides) + rng.normal(0, surface, (n, 3))
+    top = rng.normal(0, 0.012 * 0.04, n)  # of a cap 40 mm wide
+    apexes = curve * lean @ sides + top[:, None] * axis + rng.normal(0, surface, (n, 3))
     found = replace(
         locations(DepthSource.MEASURED, DepthSource.MEASURED),
         sigma_position=np.full((2, 3), surface),
@@ -464,8 +464,8 @@ def test_the_sigma_of_a_leaning_apex_turns_with_the_cap() -> None:
     picks = MakePicks(T_base_camera=base).process(
         frame_of(np.zeros((120, 160))), circles, found, poses
     )
-    across = 0.3 * 0.05 * np.radians(20) / np.sqrt(2)
-    along = 0.3 * 0.05 * 0.04
+    across = 0.4 * 0.05 * np.radians(20) / np.sqrt(2)
+    along = 0.05 * 0.012
     np.testing.assert_allclose(picks.sigma_position[0], [across, across, along], atol=1e-9)
 
 
