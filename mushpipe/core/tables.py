@@ -88,6 +88,13 @@ class Columns:
         taken = {name: getattr(self, name)[rows] for name in self._columns()}
         return replace(self, **taken)  # type: ignore[type-var]
 
+    def without(self, rows: Bools) -> Self:
+        """Return the same rows, of which those of a mask (N,) are unknown."""
+        if not rows.any():
+            return self
+        n = len(self)
+        return self.joined(type(self).unknown(1)).take(np.where(rows, n, np.arange(n)))
+
     def joined(self, other: Self) -> Self:
         """Return these rows, and behind them those of another."""
         both = {n: np.concatenate([getattr(self, n), getattr(other, n)]) for n in self._columns()}

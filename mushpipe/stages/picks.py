@@ -16,7 +16,7 @@ from mushpipe import Circles, DepthSource, Locations, PickFlag, Picks, Poses, Rg
 from mushpipe.core.arrays import Floats, Ints, Rows
 from mushpipe.core.errors import UsageError
 from mushpipe.core.transform import Transform, TransformSetting
-from mushpipe.stages.plausible import require_plausible
+from mushpipe.stages.plausible import contradictory, require_plausible
 from mushpipe.stages.rows import require_same_rows
 from mushpipe.stages.surroundings import clearance, hidden_share
 from mushpipe.stages.tracks import Tracks
@@ -127,6 +127,8 @@ class MakePicks(Stage):
         poses = Poses.unknown(n) if poses is None else poses
         require_same_rows(circles, locations, poses, frame.camera)
         require_plausible(circles, locations, poses, frame.camera)
+        wrong = contradictory(circles, locations, poses, frame.camera)
+        locations, poses = locations.without(wrong), poses.without(wrong)
         poses = self._outward(poses, locations, frame.header.sequence)
         self._total += n
         self._missing += int((locations.source == DepthSource.MISSING).sum())
@@ -167,8 +169,7 @@ class MakePicks(Stage):
                 "poses are left out: an axis points out of its cap, and a robot comes from there",
                 *(sequence, away.sum(), poses.valid.sum()),
             )
-        n = len(poses)
-        return poses.joined(Poses.unknown(1)).take(np.where(away, n, np.arange(n)))
+        return poses.without(away)
 
     def _flags(
         self,

@@ -11,6 +11,7 @@ from mushpipe.core.geometry import Camera, lengths
 _METRES = "are all lengths in metres, and all of this circle?"
 # No unit is mistaken for another by less. What is found differs by a factor of three at most.
 UNIT = 10.0
+MOST = 4.0  # times that the lengths of one row may differ: one of them is of something else
 LARGEST_M = 1.0  # no mushroom is larger, in metres
 
 
@@ -24,6 +25,27 @@ def require_plausible(
     if camera is not None:
         _require_size(circles, locations, poses, camera)
     _require_mushrooms(locations)
+
+
+def contradictory(
+    circles: Circles, locations: Locations, poses: Poses, camera: Camera | None
+) -> Bools:
+    """Return of which rows (N,) position, size and circle cannot be those of one mushroom.
+
+    Depth of a flying pixel at the centre puts a cap metres away, where its circle is as wide as a
+    table and its diameter is not. A length of another unit is alone where one mushroom is in view.
+    """
+    wrong = np.asarray(locations.diameter > LARGEST_M)
+    if camera is None:
+        return wrong
+    across = _across(circles, locations, camera)
+    far = lengths(poses.apex - locations.position) > MOST * across
+    return wrong | far | _differ(locations.diameter, across, MOST)
+
+
+def _across(circles: Circles, locations: Locations, camera: Camera) -> Floats:
+    """Return how wide circles (N,) are where their locations are, m."""
+    return np.asarray(2 * circles.radius * locations.position[:, 2] / camera.focal)
 
 
 def _require_in_front(points: Floats, what: str) -> None:
@@ -49,10 +71,10 @@ def _require_distance(locations: Locations) -> None:
 def _require_size(circles: Circles, locations: Locations, poses: Poses, camera: Camera) -> None:
     """Raise ValueError where most diameters, or ways to apexes, are far from the circles' sizes.
 
-    A unit is wrong in all rows. In one it is a depth that is wrong, as the method of that row says:
-    the paper's takes position and diameter from different pixels.
+    A unit is wrong in all rows. In one it is a depth that is wrong: the paper's method takes
+    position and diameter from different pixels (`contradictory`).
     """
-    across = 2 * circles.radius * locations.position[:, 2] / camera.focal
+    across = _across(circles, locations, camera)
     differs = _differ(locations.diameter, across)
     if (row := _usual(differs, locations.diameter)) is not None:
         raise ValueError(
@@ -76,9 +98,9 @@ def _require_mushrooms(locations: Locations) -> None:
         )
 
 
-def _differ(given: Floats, seen: Floats) -> Bools:
-    """Return where two lengths (N,) differ as lengths of different units do."""
-    return np.asarray((given > UNIT * seen) | (seen > UNIT * given))
+def _differ(given: Floats, seen: Floats, times: float = UNIT) -> Bools:
+    """Return where two lengths (N,) differ, unless told as lengths of different units do."""
+    return np.asarray((given > times * seen) | (seen > times * given))
 
 
 def _usual(wrong: Bools, of: Floats) -> int | None:

@@ -492,3 +492,36 @@ def test_picks_in_the_robots_frame_cannot_have_the_cameras_name() -> None:
     stage = MakePicks(T_base_camera=own | {"quaternion": [1, 0, 0, 0]})
     with pytest.raises(UsageError, match="frame is 'camera_color_optical_frame'"):
         stage.process(frame_of(np.zeros((120, 160))), circles, found)
+
+
+@pytest.mark.parametrize(
+    ("position", "diameter"),
+    [
+        (9.0, 0.04),  # a flying pixel at the centre: there the circle is most of a metre wide
+        (50.0, 0.04),  # one mushroom, its position in cm
+        (0.5, 0.4),  # its diameter in dm
+        (100.0, 8.0),  # both in a unit of their own: no mushroom is that large
+    ],
+)
+def test_one_cap_whose_size_and_place_contradict_its_circle_has_no_position(
+    position: float, diameter: float
+) -> None:
+    circles = circles_at((50, 50))
+    found = locations(DepthSource.MEASURED)
+    point = found.position * position / 0.5
+    away = np.linalg.norm(point, axis=1)
+    found = replace(found, position=point, distance=away, diameter=np.array([diameter]))
+    picks = MakePicks().process(frame_of(np.zeros((120, 160))), circles, found)
+    assert np.isnan(picks.position).all()
+    assert np.isnan(picks.diameter).all()
+    assert picks.source.tolist() == [DepthSource.MISSING]
+    assert PickFlag(int(picks.flags[0])) & PickFlag.DEPTH_MISSING
+
+
+def test_the_others_keep_their_position_beside_such_a_cap() -> None:
+    circles = circles_at((50, 50), (80, 50), (110, 50))
+    found = locations(*[DepthSource.MEASURED] * 3, at=(50, 80, 110))
+    point = found.position * np.array([[1.0], [18.0], [1.0]])
+    found = replace(found, position=point, distance=np.linalg.norm(point, axis=1))
+    picks = MakePicks().process(frame_of(np.zeros((120, 160))), circles, found)
+    assert sorted(picks.center[np.isfinite(picks.position[:, 2]), 0].tolist()) == [50, 110]
