@@ -72,9 +72,12 @@ class Transform(Group):
         where errors are no larger along the ray, they are taken for independent.
 
         Args:
-            sigmas: In the camera's frame; rows of NaN stay NaN.
+            sigmas: In the camera's frame; rows of NaN stay NaN, and one that is infinite makes the
+                whole row infinite, for what is not known along one axis may lie along any.
             points: In the camera's optical frame, m.
         """
+        lost = np.isinf(sigmas).any(axis=1, keepdims=True)
+        sigmas = np.where(lost, np.nan, sigmas)
         rays = points / np.linalg.norm(points, axis=1, keepdims=True)
         variances, squares = sigmas**2, rays**2
         excess, share = (v[:, 2] - v[:, :2].mean(axis=1) for v in (variances, squares))
@@ -83,7 +86,8 @@ class Transform(Group):
         # no axis has more of it than all its variance
         along = np.minimum(along, (variances / np.maximum(squares, 1e-12)).min(axis=1))[:, None]
         rest = (variances - along * squares) @ (self._matrix() ** 2).T
-        return np.asarray(np.sqrt(along * self.directions(rays) ** 2 + rest))
+        turned = np.sqrt(along * self.directions(rays) ** 2 + rest)
+        return np.where(lost, np.inf, turned)
 
     def rotations(self, quaternions: Floats) -> Floats:
         """Turn (N, 4) orientations, x y z w; rows of NaN stay NaN."""

@@ -12,6 +12,8 @@ from collections.abc import Set
 
 from mushpipe.robot.targets import Choice, Target
 
+USUAL_M = 0.04  # diameter of a target of which none is known
+
 
 class Places:
     """The places at which targets that are claimed were last seen."""
@@ -33,6 +35,7 @@ class Places:
         return any(
             target.id > largest
             and frame == known_frame
-            and math.dist(target.row[:3], known.row[:3]) < max(target.row[7], known.row[7]) / 2
+            and math.dist(target.row[:3], known.row[:3])
+            < (max(target.row[7], known.row[7]) or USUAL_M) / 2
             for known, known_frame, largest in self._claimed.values()
         )

@@ -31,6 +31,7 @@ from mushpipe.sources.realsense_frames import Domain, clock_of
 logger = logging.getLogger("mushpipe")
 # Stamps further from the host's clock than this are late, or in a clock of their own.
 SAME_CLOCK_NS = 2 * 10**9
+LATE = 10  # results in a row that are too old when they come: the chain is slow, not the moment
 
 
 class RobotJsonSink(Sink):
@@ -89,6 +90,7 @@ class RobotJsonSink(Sink):
     _transcript: Transcript | None = PrivateAttr(None)
     _ending: Ending = PrivateAttr("failed")
     _live: bool = PrivateAttr(False)
+    _late: int = PrivateAttr(0)
     _warned: set[str] = PrivateAttr(default_factory=set)
 
     @field_validator("bind")
@@ -206,9 +208,20 @@ class RobotJsonSink(Sink):
         if self._server is None or self._filter is None:
             raise RuntimeError("the sink is not open")
         header = trace.frame.header
-        choice = self._filter(picks)
-        self._server.hub.publish(choice, header.sequence, header.stamp_ns, self._taken(trace))
+        choice, taken = self._filter(picks), self._taken(trace)
+        self._server.hub.publish(choice, header.sequence, header.stamp_ns, taken)
         self._server.wake()
+        self._watch(1000 * (self._clock.monotonic() - taken))
+
+    def _watch(self, age_ms: float) -> None:
+        """Say it, once, where results are regularly too old to be sent."""
+        self._late = self._late + 1 if self.max_age_ms < age_ms < inf else 0
+        if self._late == LATE:
+            self._warn(
+                f"results are {age_ms:.0f} ms old when they come, and 'max_age_ms' is "
+                f"{self.max_age_ms:g}: robots get nothing; the stages are too slow, or the "
+                "camera's time stamps run behind"
+            )
 
     def _taken(self, trace: Trace) -> float:
         """Return the monotonic time a frame was taken at, s; minus infinity where unknown.

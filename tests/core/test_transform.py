@@ -87,3 +87,11 @@ def test_spreads_are_independent_where_nothing_says_they_are_along_the_ray() -> 
     sigmas = np.array([[0.001, 0.002, 0.001], [np.nan] * 3])
     spreads = quarter.spreads(sigmas, np.array([[0.1, 0.1, 0.5], [np.nan] * 3]))
     np.testing.assert_allclose(spreads, [[0.002, 0.001, 0.001], [np.nan] * 3])
+
+
+def test_a_spread_that_is_infinite_stays_so() -> None:
+    turned = Transform(frame="b", translation=(0, 0, 0), quaternion=(1, 0, 0, 0))
+    sigmas = np.array([[0.001, 0.001, np.inf], [0.001, 0.001, 0.002]])
+    spreads = turned.spreads(sigmas, np.array([[0.1, 0.1, 0.5]] * 2))
+    assert np.isinf(spreads[0]).all()
+    np.testing.assert_allclose(spreads[1], sigmas[1])

@@ -352,6 +352,21 @@ def test_a_frame_whose_age_nobody_knows_is_stale(
     assert "not of this host" in caplog.text
 
 
+def test_a_chain_that_is_too_slow_says_why_robots_get_nothing(
+    sink: RobotJsonSink, caplog: pytest.LogCaptureFixture
+) -> None:
+    clock = live_clock(sink)
+    for spent in (0.7,) * 9 + (0.1,) + (0.7,) * 9:  # a moment, twice
+        clock.now += 1
+        consume(sink, clock.wall_ns() - round(spent * 1e9), clock.wall_ns(), spent)
+    assert "robots get nothing" not in caplog.text
+    for _ in range(5):
+        clock.now += 1
+        consume(sink, clock.wall_ns() - 7 * 10**8, clock.wall_ns(), 0.7)
+    assert "results are 700 ms old when they come, and 'max_age_ms' is 500" in caplog.text
+    assert caplog.text.count("robots get nothing") == 1
+
+
 def test_the_latency_of_the_sensor_is_added() -> None:
     sink = RobotJsonSink(port=0, sensor_latency_ms=40)
     sink._clock = clock = FakeClock()
