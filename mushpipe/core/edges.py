@@ -74,7 +74,9 @@ def files_read(plan: Plan) -> tuple[Path, ...]:
     read = (node.plugin.path_settings(written=False) for node in plan.nodes)
     given = (path for paths in read for path in paths.values())
     graph = Path(plan.file)
-    return (graph, *(graph.parent / file for file in code), *given, *files_of(plan.source))
+    inside = (path for node in plan.nodes for path in node.read)
+    code_files = (graph.parent / file for file in code)
+    return (graph, *code_files, *given, *inside, *files_of(plan.source))
 
 
 def files_of(node: Node, run: RunInfo | None = None) -> tuple[Path, ...]:

@@ -12,7 +12,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from mushpipe.core.document import Document, Location
-from mushpipe.core.errors import GraphError, PluginError, Problem, suggest
+from mushpipe.core.errors import GraphError, PluginError, Problem, UsageError, suggest
 from mushpipe.core.faults import faults_of
 from mushpipe.core.overrides import apply_override, encoding_fault
 from mushpipe.core.overwriting import same_file
@@ -28,6 +28,7 @@ from mushpipe.core.settings import (
     writing_fault,
 )
 from mushpipe.core.stage import Kind, Plugin, RunInfo, Sink, Source
+from mushpipe.core.transform import Transform
 from mushpipe.core.wire import BASE_TOPIC, RESULT_PREFIX, TIMING_TOPIC, TOTAL
 from mushpipe.core.wiring import wire
 
@@ -142,6 +143,8 @@ def _shaped(document: Document) -> bool:
 
 
 def _replace_source(document: Document, source: str, registry: Registry) -> None:
+    if not source:
+        raise UsageError("--source is empty: expected a recording, a folder, or a source's name")
     label = f"--source {source}"
     source = str(from_home(source)) if source.startswith("~") else source
     name = source.rpartition(":")[2]  # which may say whose it is
@@ -208,6 +211,10 @@ def _check_files(document: Document, nodes: list[Node]) -> list[Problem]:
     """
     problems: list[Problem] = []
     taken: list[tuple[Path, str]] = []
+    streams = [node.name for node in nodes if node.plugin.streams()]
+    for name in streams[1:]:
+        message = f"sink '{name}' would write to standard output beside sink '{streams[0]}'"
+        problems.append(document.problem(("sinks", name), message, key=True))
     for node in nodes:
         files: tuple[Path, ...] = ()
         with suppress(Exception):  # of a plugin, whose fault a run tells of
@@ -274,7 +281,13 @@ def _node(
         for key, value in settings.items()
         if isinstance(getattr(plugin, attributes.get(key, key), None), Path)
     }
-    return Node(str(at[-1]), kind, use, plugin, ports, dict(inputs), delivery, paths=paths)
+    read = tuple(
+        (Path.cwd() if key in shell else document.base) / from_home(value)
+        for key, value in settings.items()
+        if isinstance(value, str)
+        and isinstance(getattr(plugin, attributes.get(key, key), None), Transform)
+    )
+    return Node(str(at[-1]), kind, use, plugin, ports, dict(inputs), delivery, {}, paths, read)
 
 
 def _drop_foreign(

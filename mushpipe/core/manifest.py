@@ -66,5 +66,6 @@ def manifest_path(plan: Plan) -> Path:
     info = RunInfo(recording_of(plan.source), {})
     for node in plan.sinks:
         for path in files_of(node, info):
-            return path.with_suffix(".run.json")
+            if path.is_file() or not path.exists():  # not beside a device such as /dev/null
+                return path.with_suffix(".run.json")
     return Path("run.json")

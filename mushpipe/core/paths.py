@@ -13,6 +13,8 @@ from typing import Annotated, Any, Union, get_args, get_origin
 from pydantic import AfterValidator, BaseModel, ValidationInfo
 from pydantic.fields import FieldInfo
 
+from mushpipe.core.errors import UsageError
+
 STDIO = Path("-")
 """In place of a file: standard output."""
 
@@ -50,15 +52,46 @@ GraphPath = Annotated[Path, AfterValidator(resolve_path)]
 """A path setting: relative to the graph file, or to the shell where the command line set it."""
 
 
+def require_listed(folder: Path) -> None:
+    """Raise UsageError where a folder may not be read, in which a search finds nothing."""
+    if folder.is_dir() and not os.access(folder, os.R_OK | os.X_OK):
+        raise UsageError(f"{folder}: the folder cannot be read: permission denied")
+
+
 def only_recording(path: Path) -> Path:
-    """Raise ValueError where braces of a sink's path hold anything but ``recording``."""
+    """Raise ValueError where a sink's path has more to fill in than the name of its input."""
+    if variable := re.search(r"\$\{?[A-Za-z_]\w*\}?", str(path)):
+        raise ValueError(
+            f"{variable[0]} is not filled in here: only {{recording}} is; name the "
+            'file, or let the shell do it, as in --set "log.path=$HOME/x.mcap"'
+        )
     if unknown := set(re.findall(r"\{[^}]*\}", str(path))) - {"{recording}"}:
         raise ValueError(f"{', '.join(sorted(unknown))} is not known: only {{recording}} is")
     return path
 
 
-SinkPath = Annotated[Path, AfterValidator(only_recording), AfterValidator(resolve_path)]
+def of_a_file(path: Path) -> Path:
+    """Raise ValueError where a path is that of the folder one is in, or of all files."""
+    if not path.name:
+        raise ValueError("it names no file")
+    return path
+
+
+SinkPath = Annotated[
+    Path, AfterValidator(only_recording), AfterValidator(resolve_path), AfterValidator(of_a_file)
+]
 """A path that a sink writes to; {recording} in it is the name of the input."""
+
+
+def no_stream(path: Path) -> Path:
+    """Raise ValueError where a path stands for standard output."""
+    if path == STDIO:
+        raise ValueError("it cannot be standard output: name a file")
+    return path
+
+
+SinkFile = Annotated[SinkPath, AfterValidator(no_stream)]
+"""A `SinkPath` of a sink that cannot write to standard output."""
 
 
 def is_written(setting: FieldInfo) -> bool:

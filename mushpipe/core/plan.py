@@ -23,7 +23,8 @@ class Link(NamedTuple):
 class Node:
     """A configured plugin in a graph; ``links`` is filled by the wiring.
 
-    ``paths`` are its path settings as the user wrote them; the plugin has them resolved.
+    ``paths`` are its path settings as the user wrote them; the plugin has them resolved. ``read``
+    are files whose content is a setting, as that of a transform may be.
     """
 
     name: str
@@ -35,6 +36,7 @@ class Node:
     delivery: Literal["every", "latest"] | None = None
     links: dict[str, Link] = field(default_factory=dict)
     paths: dict[str, str] = field(default_factory=dict)
+    read: tuple[Path, ...] = ()
 
     def resolved(self) -> dict[str, Any]:
         """Return the node's entry in a graph file, with every setting written out."""

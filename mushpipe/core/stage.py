@@ -11,6 +11,7 @@ from pydantic import Field
 
 from mushpipe.core.errors import PluginError
 from mushpipe.core.group import Group
+from mushpipe.core.overwriting import make_folder
 from mushpipe.core.paths import STDIO, is_written, real
 from mushpipe.core.types import RgbdFrame
 
@@ -34,9 +35,13 @@ class RunInfo:
     frames_read: Callable[[], int] = lambda: 0
 
     def path(self, template: Path) -> Path:
-        """Fill ``{recording}`` into a path and make its folder."""
+        """Fill ``{recording}`` into a path and make its folder.
+
+        Raises:
+            UsageError: There can be no such folder.
+        """
         path = Path(str(template).replace("{recording}", self.recording))
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         return path
 
 
@@ -60,6 +65,11 @@ class Plugin(Group):
         settings, kinds = type(self).model_fields.items(), Path | str if written else Path
         named = ((n, getattr(self, n)) for n, f in settings if is_written(f) is written)
         return {n: Path(v) for n, v in named if isinstance(v, kinds) and Path(v) != STDIO}
+
+    def streams(self) -> bool:
+        """Whether a setting of what is written is standard output."""
+        settings = type(self).model_fields.items()
+        return any(is_written(f) and getattr(self, n) == STDIO for n, f in settings)
 
     def required_inputs(self) -> frozenset[str]:
         """Return inputs that a graph may leave out, but not with these settings."""

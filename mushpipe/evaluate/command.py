@@ -9,6 +9,7 @@ from itertools import combinations
 from pathlib import Path
 
 from mushpipe.core.errors import EXIT_DAMAGED, EXIT_DIFFERS, EXIT_OK, InputError, UsageError
+from mushpipe.core.overwriting import spare
 from mushpipe.core.plan import Plan
 from mushpipe.core.report import RunReport
 from mushpipe.evaluate.compare import differences
@@ -221,6 +222,8 @@ def _judge_graph(
     if recordings:
         played = [*zip(recordings, unique_names(recordings), strict=True)]
     runs = plans(graph, recordings, request.overrides, options, folder)
+    for *_, plan in runs:
+        spare(result_path(plan), *request.truth)
     for text in dict.fromkeys(text for *_, plan in runs for text in plan.warnings):
         logger.warning(text)
     for option, number, plan in runs:

@@ -23,6 +23,7 @@ EXAMPLE = (
     '{"mushpipe_labels": 1, "frames": [{"index": 0, "caps": '
     '[{"u": 320.5, "v": 201.0, "radius_px": 24.5}]}]}'
 )
+FARTHEST_M = 20.0  # of a cap from its camera
 SHORTEST = 1e-6  # length of an axis that points somewhere
 _STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -55,6 +56,13 @@ class Cap(Circle):
         if diameter is not None and diameter >= 1:
             raise ValueError(f"a cap of {diameter:g} m: are lengths in metres?")
         return diameter
+
+    @field_validator("surface_m", "apex_m")
+    @classmethod
+    def _near(cls, point: list[float] | None) -> list[float] | None:
+        if point is not None and math.hypot(*point) > FARTHEST_M:
+            raise ValueError(f"a cap {math.hypot(*point):g} m away: are lengths in metres?")
+        return point
 
     @field_validator("axis")
     @classmethod

@@ -12,10 +12,13 @@ from mushpipe.core.document import read_document
 from mushpipe.core.edges import recording_of
 from mushpipe.core.errors import UsageError
 from mushpipe.core.graph import compile_document
+from mushpipe.core.paths import require_listed
 from mushpipe.core.plan import Plan
 from mushpipe.core.plugins import Registry, load_registry
 from mushpipe.core.report import RunReport
 from mushpipe.core.stage import RunInfo, Sink
+
+_NO_BRACES = str.maketrans("{}", "()")
 
 SINK = "evaluation"
 Override = str | tuple[str, str]
@@ -64,10 +67,11 @@ def recordings_in(paths: Sequence[Path]) -> list[Path]:
     """Return the recordings that paths name; a folder stands for all ``*.mcap`` in it.
 
     Raises:
-        UsageError: A folder holds none.
+        UsageError: A folder holds none, or may not be read.
     """
     found: list[Path] = []
     for path in paths:
+        require_listed(path)
         files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
         if not files:
             raise UsageError(
@@ -151,13 +155,16 @@ def plans(
             "source.path and source.use cannot be changed where recordings are given: they are "
             "what is played, and whose truth counts"
         )
+    if set("{}") & set(str(out)):
+        raise UsageError(f"--out {out}: a folder of results cannot have braces in its name")
     registry = load_registry()
     sources: Sequence[Path | None] = recordings or [None]
     names = unique_names(recordings) or ["results"]
     result = []
     for option, label in zip(options, numbered([slug(each) for each in options]), strict=True):
         for number, (name, recording) in enumerate(zip(names, sources, strict=True)):
-            file = out / ".".join(filter(None, [name, label, "mcap"]))
+            plain = name.translate(_NO_BRACES)  # which a sink would take for what it fills in
+            file = out / ".".join(filter(None, [plain, label, "mcap"]))
             varied = [(text, f"--matrix {text}") for text in option.overrides]
             plan = plan_for(graph, recording, [*overrides, *varied], file, registry)
             result.append((option, number, plan))

@@ -25,6 +25,7 @@ from mushpipe.core.stage import Source, Stage
 
 WARM_UP_FRAMES = 3
 TRACED_FRAMES = 5
+LEAST_FRAMES = 2  # between which CPU time is taken
 _LIBRARIES = ("mushpipe", "numpy", "numba", "opencv-python-headless")
 
 
@@ -39,11 +40,13 @@ def bench(plan_of: Callable[[int], Plan], frames: int) -> dict[str, Any]:
         Plain data, `conditions` among it; times in ms, memory in MB (1e6 bytes).
 
     Raises:
-        MushpipeError: The run failed, or had no frames.
+        MushpipeError: The run failed, or had less than two frames.
     """
     _run(plan_of(WARM_UP_FRAMES))
     watch = _Watch()
     report = _run(plan_of(frames), watch)
+    if report.processed < LEAST_FRAMES:
+        raise InputError(f"{plan_of(frames).file}: one frame is too few to measure CPU time with")
     cpu, elapsed = watch.cpu_s(), report.elapsed_s
     summary, peak = report.summary(), _peak_mb()
     return {

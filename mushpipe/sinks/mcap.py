@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import ByteSize, Field, PrivateAttr
 
 from mushpipe import RunInfo, Sink, SinkPath, Trace
-from mushpipe.core.errors import MushpipeError
+from mushpipe.core.errors import MushpipeError, UsageError
 from mushpipe.core.paths import STDIO
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.recording import MANIFEST, SUMMARY
@@ -70,14 +70,27 @@ class McapSink(Sink):
         return tuple(sorted({part(path, 0), *parts}))
 
     def open(self, run: RunInfo) -> None:
-        """Create the file and write the manifest; parts that a run before left go."""
+        """Create the file and write the manifest; parts that a run before left go.
+
+        Raises:
+            UsageError: Of a split recording there is a later part without the first.
+        """
         self._run, self._part, self._ended = run, 0, None
         if self.split_size is not None and self.path != STDIO and self.overwrite:
-            path = run.path(self.path)
-            for old in takewhile(Path.exists, (part(path, number) for number in count(1))):
-                old.unlink()
+            self._clear(run.path(self.path))
         self._base = base_of(run.manifest.get("graph", {}))
         self._writer = self._begin(run)
+
+    def _clear(self, path: Path) -> None:
+        """Delete the later parts of a recording whose first one will be written over."""
+        old = [*takewhile(Path.exists, (part(path, number) for number in count(1)))]
+        if old and not part(path, 0).exists():
+            raise UsageError(
+                f"{old[0]} is there, but no {part(path, 0).name} that it could go on from: as a "
+                "part of this recording it would be deleted; give another name"
+            )
+        for each in old:
+            each.unlink()
 
     def _begin(self, run: RunInfo) -> RecordingWriter:
         path = self.path if self.path == STDIO else run.path(self.path)

@@ -14,9 +14,10 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field, PrivateAttr, model_validator
 
-from mushpipe import Header, RunInfo, Sink, SinkPath, Trace
+from mushpipe import Header, RunInfo, Sink, Trace
 from mushpipe.core.errors import DependencyError, UsageError
 from mushpipe.core.overwriting import opened_alone
+from mushpipe.core.paths import SinkFile
 from mushpipe.core.recorder import RecordingError
 from mushpipe.core.transform import Transform, base_of
 from mushpipe.sinks.rerun_memory import Remembering
@@ -48,7 +49,7 @@ class RerunSink(Sink):
 
     delivery: ClassVar[Literal["every", "latest"]] = "latest"
 
-    save: SinkPath | None = Field(
+    save: SinkFile | None = Field(
         None, description=".rrd file to write; {recording} is the name of the input"
     )
     spawn: bool = Field(False, description="open a viewer on this machine's display")

@@ -15,8 +15,9 @@ from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, PrivateAttr, field_validator, model_validator
 
-from mushpipe import GraphPath, Header, Picks, RunInfo, Sink, SinkPath, Trace
+from mushpipe import GraphPath, Header, Picks, RunInfo, Sink, Trace
 from mushpipe.core.errors import EXIT_INTERRUPTED, EXIT_NO_DEVICE, EXIT_OK, UsageError
+from mushpipe.core.paths import SinkFile
 from mushpipe.robot.abb import AbbSession
 from mushpipe.robot.clock import Clock, Lateness, Placer
 from mushpipe.robot.connection import Kind, Limits
@@ -78,7 +79,7 @@ class RobotJsonSink(Sink):
     tls_client_ca: GraphPath | None = Field(
         None, description="clients must show a certificate signed by this one, PEM"
     )
-    transcript: SinkPath | None = Field(
+    transcript: SinkFile | None = Field(
         None, description="MCAP file for every line out and in; {recording} is the input's name"
     )
 

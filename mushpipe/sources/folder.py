@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from mushpipe import Header, InputError, ReplaySource, RgbdFrame, UsageError
-from mushpipe.core.paths import GraphPath
+from mushpipe.core.paths import GraphPath, require_listed
 from mushpipe.core.types import COLOR_FRAME
 from mushpipe.sources.recorded import NO_CAMERA, NO_DEPTH, Intrinsics
 
@@ -151,6 +151,7 @@ def _required(folder: Path, setting: str, names: str) -> dict[str, Path]:
     Raises:
         InputError: There are none.
     """
+    require_listed(folder)
     if found := _named(folder, names):
         return found
     files = [path for path in folder.glob("**/*") if path.is_file()]

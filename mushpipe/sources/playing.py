@@ -206,7 +206,11 @@ class Player:
 
     def _depth(self, message: Any, raw: Raw) -> tuple[int, _Depth]:
         stated = raw.channel.metadata.get("depth_scale")
-        scale = float(stated) if stated else self.settings.depth_scale
+        asked = self.settings.depth_scale
+        scale = float(stated) if stated else asked
+        if asked is not None and scale not in (None, asked):
+            text = f"it states a depth scale of {scale:g} m, which source.depth_scale ({asked:g})"
+            self._warn(f"{text} does not change")
         stamp_ns, frame_id = _stamp(message, raw)
         return stamp_ns, (frame_id, *decode_depth(message, scale))
 

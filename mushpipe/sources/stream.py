@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from io import BufferedReader, RawIOBase
 from itertools import chain, islice
+from pathlib import Path
 from typing import Any
 
 from mcap.exceptions import InvalidMagic
@@ -22,6 +23,7 @@ from pydantic import PrivateAttr
 
 from mushpipe.core import wire
 from mushpipe.core.errors import InputError, UsageError
+from mushpipe.core.paths import real
 from mushpipe.core.recording import GARBAGE, MANIFEST, Raw
 from mushpipe.core.types import RgbdFrame
 from mushpipe.sources.pairing import Pairing
@@ -55,6 +57,11 @@ class StreamSource(RecordedSource):
         """Whether the sender has a camera; known once the stream is open. A file has none."""
         saved = stat.S_ISREG(os.fstat(self._number).st_mode)
         return self._manifest.get("live") == "true" and not saved
+
+    def files(self) -> tuple[Path, ...]:
+        """Return the saved stream, where standard input is a file and not a pipe."""
+        path = real(Path(f"/proc/self/fd/{self._number}"))
+        return (path,) if path.is_file() else ()
 
     def name(self) -> str:
         """Return ``stream``."""

@@ -50,7 +50,7 @@ def test_a_claim_on_a_mushroom_of_unknown_size_outlives_its_id_as_well() -> None
     scene, size = Scene(), np.full(3, np.nan)
     scene.show(choice(3, id=np.arange(3), position=POSITIONS, diameter=size))
     scene.say("a", 1, "accepted")
-    moved = POSITIONS + [0.002, -0.003, 0.001]
+    moved = POSITIONS + np.array([0.002, -0.003, 0.001])
     assert scene.show(choice(3, id=np.arange(3, 6), position=moved, diameter=size)) == [3, 5]
 
 
