@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from mushpipe import RunInfo
 from mushpipe.core.errors import EXIT_USAGE
 from mushpipe.sinks.mcap import McapSink
 from mushpipe.sinks.rerun import RerunSink
-from tests.cli.shell import mushpipe
+from tests.cli.shell import MAIN, ROOT, mushpipe
 from tests.io.values import make_frame, record, trace_of
 
 
@@ -78,6 +79,76 @@ def test_no_command_writes_over_what_it_reads(recorded: Path) -> None:
         assert done.returncode == EXIT_USAGE, done.stderr
         assert "b.mcap is what is read, and would be written over" in done.stderr
         assert (recorded / "a.mcap").read_bytes() == before
+
+
+def test_a_saved_stream_is_not_written_over_by_what_plays_it(folder: Path) -> None:
+    saved = folder / "s.mcap"
+    record(saved, [trace_of(make_frame())])
+    before = saved.read_bytes()
+    options = ("--source", "-", "--set", "log.path=./s.mcap")
+    with saved.open("rb") as stream:
+        command = [*MAIN, "run", "graph.yaml", *options]
+        done = subprocess.run(command, cwd=folder, stdin=stream, capture_output=True, text=True)
+    assert done.returncode == EXIT_USAGE
+    assert "sink 'log' would write over what" in done.stderr
+    assert saved.read_bytes() == before
+
+
+def test_the_pose_of_the_camera_is_not_written_over(recorded: Path) -> None:
+    mount = "{frame: base, translation: [0, 0, 1], quaternion: [1, 0, 0, 0]}"
+    (recorded / "camera.yaml").write_text(mount)
+    (recorded / "own.yaml").write_text(
+        "mushpipe: 1\nsource: {use: mcap, path: a.mcap}\n"
+        "stages:\n  segment: {use: otsu}\n  detect: {use: hough}\n"
+        "  locate: {use: nearest-depth}\n  pick: {use: picks, T_base_camera: camera.yaml}\n"
+        "sinks: {log: {use: mcap, path: camera.yaml}}\n"
+    )
+    done = mushpipe("run", "own.yaml", cwd=recorded)
+    assert done.returncode == EXIT_USAGE
+    assert "sink 'log' would write over what the run reads" in done.stderr
+    assert (recorded / "camera.yaml").read_text() == mount
+
+
+def test_an_evaluation_does_not_write_over_the_truth(recorded: Path) -> None:
+    (recorded / "truth").mkdir()
+    truth = recorded / "truth" / "lab.mcap"
+    lab = "recordings/lab.mcap"
+    truth.write_bytes((ROOT / lab).read_bytes())
+    before = truth.read_bytes()
+    done = mushpipe(
+        *("eval", "graph.yaml", "--recordings", ROOT / lab, "--truth", truth, "--out", "truth"),
+        cwd=recorded,
+    )
+    assert done.returncode == EXIT_USAGE
+    assert "lab.mcap is what is read, and would be written over" in done.stderr
+    assert truth.read_bytes() == before
+
+
+def test_standard_output_is_for_one_sink(recorded: Path) -> None:
+    text = (recorded / "graph.yaml").read_text()
+    (recorded / "graph.yaml").write_text(text + '  again: {use: mcap, path: "-"}\n')
+    done = mushpipe("validate", "graph.yaml", "--set", "log.path=-", cwd=recorded)
+    assert done.returncode == EXIT_USAGE
+    assert "sink 'again' would write to standard output beside sink 'log'" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--set", "log.path=."), "it names no file"),
+        (("--set", "log.path=$OUT/x.mcap"), "$OUT is not filled in here"),
+        (("--set", "log.path=graph.yaml/x.mcap"), "graph.yaml cannot be a folder: File exists"),
+        (("--source", ""), "--source is empty"),
+    ],
+)
+def test_paths_that_cannot_be_meant_are_refused(
+    recorded: Path, options: tuple[str, ...], message: str
+) -> None:
+    before = {*recorded.iterdir()}
+    done = mushpipe("run", "graph.yaml", "--source", "a.mcap", *options, cwd=recorded)
+    assert done.returncode == EXIT_USAGE
+    assert message in done.stderr
+    assert {*recorded.iterdir()} == before
 
 
 def test_a_sink_of_ones_own_is_kept_from_its_source_by_the_type_of_its_path(recorded: Path) -> None:

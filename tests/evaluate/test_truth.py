@@ -141,6 +141,18 @@ def test_conversion_leaves_the_own_format_alone() -> None:
         (
             {
                 "mushpipe_labels": 1,
+                "frames": [
+                    {
+                        "index": 0,
+                        "caps": [{"u": 1, "v": 1, "radius_px": 9, "apex_m": [10, 20, 500]}],
+                    }
+                ],
+            },
+            "caps.0.apex_m: a cap 500.5 m away: are lengths in metres?",
+        ),
+        (
+            {
+                "mushpipe_labels": 1,
                 "frames": [{"index": 0, "caps": [{"u": 1, "v": 1, "radius_px": -1}]}],
             },
             "radius_px",

@@ -399,3 +399,14 @@ def test_stamps_that_go_back_neither_turn_frames_round_nor_lose_what_is_beside_t
     assert [frame.header.sequence for frame in frames] == [10, 11, 12, 13, 14, 15]
     numbers = [json.loads(f.attached["/clock"].data)["number"] for f in frames]
     assert numbers == [[i] for i in range(6)]
+
+
+def test_a_depth_scale_that_the_recording_states_is_kept_and_the_setting_told_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = record(tmp_path / "a.mcap", [trace_of(make_frame())])
+    (plain,) = McapSource(path=path).frames()
+    (asked,) = McapSource(path=path, depth_scale=0.005).frames()
+    assert asked.depth_scale == plain.depth_scale
+    assert f"states a depth scale of {plain.depth_scale:g} m" in caplog.text
+    assert "source.depth_scale (0.005) does not change" in caplog.text

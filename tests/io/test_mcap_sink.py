@@ -298,6 +298,14 @@ def test_a_part_that_cannot_be_begun_is_why_nothing_more_is_recorded(tmp_path: P
     sink.close()
 
 
+def test_a_later_part_without_the_first_is_not_deleted(tmp_path: Path) -> None:
+    other = tmp_path / "bed_001.mcap"
+    other.write_bytes(b"another recording")
+    with pytest.raises(UsageError, match=r"bed_001.mcap is there, but no bed_000.mcap"):
+        McapSink(path=tmp_path / "bed.mcap", split_size=1).open(RunInfo("", {}))
+    assert other.read_bytes() == b"another recording"
+
+
 def test_a_shorter_run_leaves_no_parts_of_the_one_before_and_touches_nothing_else(
     tmp_path: Path,
 ) -> None:
