@@ -25,13 +25,16 @@ RING = np.stack([np.outer(_REACH, np.cos(_TURNS)), np.outer(_REACH, np.sin(_TURN
 RING = np.ascontiguousarray(RING.reshape(-1, 2))
 CLEAR = 1.15  # radii of a circle within which there is no ground
 LEAST = 20  # samples of the ground
+BARE = 0.3  # share of the ground, its darkest, that is soil: the rest may be mycelium
 CLOD_CHANCE = 0.05  # of what is one to be a cap; 1 of 68 was on another renderer's frames
+SOIL = slice(4, 7)  # columns of what `ground_of` returns
 NIGHT = 16.0  # gray levels; darker ground looks like everything
 
 
 def clods(color: Bytes, circles: Circles, kin: Kin) -> Bools:
     """Return which circles (N,) look as the ground does and not as most sure caps do.
 
+    Between patches of mycelium a clod looks as the soil there does, the darkest of the ground.
     Nothing is one where few circles are sure, and where no ground is seen or it is too dark to
     tell.
 
@@ -43,7 +46,9 @@ def clods(color: Bytes, circles: Circles, kin: Kin) -> Bools:
     if not len(kin.sure):
         return np.zeros(len(circles), np.bool_)
     odd = 2 * alike(*kin, ODD) < len(kin.sure)
-    return off_ground(kin.tones, ground_of(color, circles, odd)) < ALIKE
+    ground = ground_of(color, circles, odd)
+    away = np.fmin(off_ground(kin.tones, ground), off_ground(kin.tones, ground[:, SOIL]))
+    return away < ALIKE
 
 
 def ground_of(color: Bytes, circles: Circles, asked: Bools) -> Floats:
@@ -55,20 +60,23 @@ def ground_of(color: Bytes, circles: Circles, asked: Bools) -> Floats:
         asked: (N,) of which circles.
 
     Returns:
-        (N, 4) tone, as by `cap_kin.tones_of`, and standard deviation of the brightness over its
-        mean. NaN where it is not asked for, no ground is seen, or it is too dark to tell.
+        (N, 7) tone, as by `cap_kin.tones_of`; standard deviation of the brightness over its mean;
+        tone of the soil (`SOIL`), which is the darkest of it. NaN where it is not asked for, no
+        ground is seen, or it is too dark to tell.
     """
-    ground = np.full((len(circles), 4), np.nan)
+    ground = np.full((len(circles), 7), np.nan)
     discs, likely = discs_of(circles), circles.score >= LIKELY
-    near = np.empty(len(discs), np.int64)
-    _grounds(locked(color, np.uint8), discs, asked, likely, near, ground)
+    near, samples = np.empty(len(discs), np.int64), np.empty((len(RING), 4))
+    _grounds(locked(color, np.uint8), discs, asked, likely, near, samples, ground)
     ground[ground[:, 0] < math.log(NIGHT + DARK)] = np.nan
+    ground[ground[:, SOIL.start] < math.log(NIGHT + DARK), SOIL] = np.nan
     ground[:, :3] /= UNIT
+    ground[:, SOIL] /= UNIT
     return ground
 
 
 def off_ground(tones: Floats, ground: Floats) -> Floats:
-    """Return how far the tones (N, 3) of circles are from that of the ground (N, 4) around them."""
+    """Return how far tones (N, 3) of circles are from that (N, 3 or more) of what is around."""
     return np.asarray(np.linalg.norm(tones - ground[:, :3], axis=1))
 
 
@@ -79,32 +87,67 @@ def darker(tones: Floats, level: float) -> Bools:
 
 @borrower
 def _grounds(
-    color: Bytes, discs: Floats, asked: Bools, likely: Bools, near: Ints, ground: Floats
-) -> None:
-    """Write tone and unevenness (N, 4) of the ground around the discs (N, 3) that are asked for.
+    color: Bytes, discs: Floats, asked: Bools, likely: Bools,
+    near: Ints, samples: Floats, ground: Floats,
+) -> None:  # fmt: skip
+    """Write (N, 7) what the ground around the discs (N, 3) is like that are asked for.
 
-    `near` (N,) is room to work in.
+    `near` (N,) and `samples` (S, 4), one for each of `RING`, are room to work in.
     """
     height, width = color.shape[:2]
     for k in range(len(discs)):
         if not asked[k]:
             continue
         count = _neighbours(k, discs, likely, near)
-        red = green = blue = squares = seen = 0
+        seen = 0
         for s in range(len(RING)):
             x, y = discs[k, 0] + discs[k, 2] * RING[s, 0], discs[k, 1] + discs[k, 2] * RING[s, 1]
             u, v = math.floor(x + 0.5), math.floor(y + 0.5)
             if 0 <= u < width and 0 <= v < height and _free(x, y, discs, near[:count]):
-                red += int(color[v, u, 0])
-                green += int(color[v, u, 1])
-                blue += int(color[v, u, 2])
-                gray = int(color[v, u, 0]) + int(color[v, u, 1]) + int(color[v, u, 2])
-                squares += gray * gray
+                for c in range(3):
+                    samples[seen, c] = color[v, u, c]
+                samples[seen, 3] = samples[seen, 0] + samples[seen, 1] + samples[seen, 2]
                 seen += 1
         if seen >= LEAST:
-            write_tone(red / seen, green / seen, blue / seen, ground[k])
-            mean = (red + green + blue) / seen
-            ground[k, 3] = math.sqrt(max(0.0, squares / seen - mean * mean)) / (mean + 3 * DARK)
+            _describe(samples[:seen], ground[k])
+
+
+@borrower
+def _describe(samples: Floats, ground: Floats) -> None:
+    """Write (7,) what samples (S, 4) of the ground are like: red, green, blue and their sum."""
+    mean = _write_mean(samples, math.inf, ground[:3])
+    squares = 0.0
+    for s in range(len(samples)):
+        squares += samples[s, 3] ** 2
+    deviation = math.sqrt(max(0.0, squares / len(samples) - mean * mean))
+    ground[3] = deviation / (mean + 3 * DARK)
+    _write_mean(samples, _darkest(samples[:, 3]), ground[4:])
+
+
+@borrower
+def _write_mean(samples: Floats, limit: float, tone: Floats) -> float:
+    """Write the tone (3,) of the mean of the samples (S, 4) up to a brightness, and return that."""
+    red = green = blue = 0.0
+    count = 0
+    for s in range(len(samples)):
+        if samples[s, 3] <= limit:
+            red, green, blue = red + samples[s, 0], green + samples[s, 1], blue + samples[s, 2]
+            count += 1
+    write_tone(red / count, green / count, blue / count, tone)
+    return float((red + green + blue) / count)
+
+
+@borrower
+def _darkest(brightness: Floats) -> float:
+    """Return the brightest of the darkest samples (S,) that are a share `BARE` of all."""
+    limit = 0.0
+    for s in range(len(brightness)):
+        darker = 0
+        for m in range(len(brightness)):
+            darker += brightness[m] < brightness[s]
+        if darker <= BARE * len(brightness):
+            limit = max(limit, brightness[s])
+    return limit
 
 
 @borrower

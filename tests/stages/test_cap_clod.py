@@ -74,6 +74,15 @@ def test_a_cap_as_dark_as_soil_that_lies_on_something_bright_is_none() -> None:
     assert not clods(color, circles).any()
 
 
+def test_a_clod_on_soil_between_patches_of_mycelium_is_one() -> None:
+    circles = circles_of(20)
+    color = bed(circles, tones_of(20, WHITE, {8: CLOD, 9: BROWN}))
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    soil = (color == SOIL.astype(np.uint8)).all(axis=2)
+    color[soil & ((u // 6 + v // 6) % 2 == 0)] = WHITE
+    assert np.flatnonzero(clods(color, circles)).tolist() == [8]
+
+
 def test_in_the_dark_all_looks_alike_and_nothing_is_said() -> None:
     circles = circles_of(20)
     tones = tones_of(20, WHITE, {4: CLOD})

@@ -128,8 +128,12 @@ def test_one_cap_among_clutter_is_found_with_depth_and_hardly_a_cup_is_fitted() 
 
 @pytest.mark.parametrize("learned", [False, True])
 def test_what_is_hardly_a_cap_changes_nothing_about_those_that_are_likely(learned: bool) -> None:
+    """But where depth alone is against a circle: it may stand for the same cap, as `cap-fit` says.
+
+    Whether a frame has such a circle differs by the last bits of the network, hence by processor.
+    """
     settings = {"soil": 3.0, "rubble": 50, "stumps": 5, "count": 60, "cluster": 1.0}
-    below = 0
+    below = contested = 0
     for seed in (81, 82):
         frame = simulated(seed, width=640, height=480, shape_family="b", **settings)
         mask, circles = CapNet(radius_px=RADII, min_score=0.05).process(frame)
@@ -138,11 +142,15 @@ def test_what_is_hardly_a_cap_changes_nothing_about_those_that_are_likely(learne
             for least in (0.5, 0.05)
         )
         likely, found = some.process(frame, mask, circles), many.process(frame, mask, circles)
-        same = found.take(found.score >= 0.5)
+        same, hardly = found.take(found.score >= 0.5), found.take(found.score < 0.5)
+        iou = circle_iou(likely.center, likely.radius, hardly.center, hardly.radius)
+        alone = (iou < 0.5).all(axis=1) if learned else np.ones(len(likely), bool)
         for column in ("center", "radius", "score"):
-            assert np.array_equal(getattr(same, column), getattr(likely, column))
-        below += len(found) - len(same)
-    assert below > 0
+            assert np.array_equal(getattr(same, column), getattr(likely.take(alone), column))
+        below += len(hardly)
+        contested += int((~alone).sum())
+    assert below > contested
+    assert contested <= 2
 
 
 def test_a_part_of_a_cap_that_becomes_the_cap_is_no_second_one() -> None:
