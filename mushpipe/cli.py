@@ -69,6 +69,24 @@ def _out(text: str) -> None:
     sys.stdout.write(text + "\n")
 
 
+def _version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        _out(f"mushpipe {version('mushpipe')}")
+        raise typer.Exit()
+
+
+@app.callback()
+def _program(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_version, is_eager=True, help="show it and end"),
+    ] = False,
+) -> None:
+    del version  # `_version` has looked at it
+
+
 def _compile(
     graph: Path, overrides: list[Any], source: str | None, more_sinks: Sequence[str] = ()
 ) -> Plan:

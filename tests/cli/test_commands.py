@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -253,6 +254,11 @@ def test_pictures_and_listings(folder: Path) -> None:
     described = mushpipe("plugins", "describe", "opening", cwd=folder).stdout
     assert "inputs   mask: Mask" in described
     assert "integer >= 1 <= 255" in described
+
+
+def test_the_version_is_that_of_the_installed_package(tmp_path: Path) -> None:
+    done = mushpipe("--version", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (0, f"mushpipe {version('mushpipe')}\n")
 
 
 @pytest.mark.parametrize("heavy", ["open3d", "rerun", "scipy", "cv2", "pyrealsense2"])
