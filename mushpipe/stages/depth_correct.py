@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
@@ -17,6 +18,8 @@ from mushpipe.core.errors import GraphError
 from mushpipe.core.jit import jit
 from mushpipe.core.types import end_of_scale
 from mushpipe.stages.warm_up import example_frame
+
+logger = logging.getLogger("mushpipe")
 
 
 class DepthCorrect(Stage):
@@ -48,13 +51,19 @@ class DepthCorrect(Stage):
         self._errors = (self.offset_mm, self.slope_mm_per_m, self.curve_mm_per_m2)
 
     def open(self) -> None:
-        """Read the calibration, and compile the kernel for both forms of depth.
+        """Read the calibration, or say what is taken off without one; compile the kernel.
 
         Raises:
             InputError: The file is missing or no such calibration.
         """
         if self.calibration is not None:
             self._errors = self._read(self.calibration)
+        elif any(self._errors):
+            logger.info(
+                "%g mm, %g mm per m and %g mm per m^2 are taken off all depth, which is the error "
+                "of one camera: 'mushpipe calibrate depth' finds that of yours",
+                *self._errors,
+            )
         for native in (np.uint16, np.float32):
             self.process(example_frame(native=native))
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from pathlib import Path
 
@@ -131,3 +132,15 @@ def test_correction_takes_the_polynomial_off_and_keeps_the_unit() -> None:
     assert out.depth_m[1, 1] == pytest.approx(0.5 - 0.002 - 0.002 - 0.002, abs=1e-6)
     assert np.isnan(out.depth_m[0, 0])
     assert out.depth_scale == 0.000125
+
+
+def test_what_is_taken_off_without_a_calibration_is_said(
+    caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    caplog.set_level(logging.INFO, "mushpipe")
+    (tmp_path / "depth.yaml").write_text("offset_mm: 1.5\n")
+    for quiet in (DepthCorrect(), DepthCorrect(calibration=tmp_path / "depth.yaml")):
+        quiet.open()
+    assert not caplog.text
+    DepthCorrect(offset_mm=2.85).open()
+    assert "2.85 mm, 0 mm per m and 0 mm per m^2 are taken off all depth" in caplog.text
