@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from pydantic import Field, PrivateAttr
 
@@ -19,7 +21,7 @@ from mushpipe.core.arrays import Bytes, Floats, Rows, Singles
 from mushpipe.core.geometry import lengths
 from mushpipe.stages.calibrated import calibration_of
 from mushpipe.stages.cap_attempt import Frame, Settings
-from mushpipe.stages.cap_batch import Fits, fit_caps
+from mushpipe.stages.cap_batch import LEVER, Fits, fit_caps
 from mushpipe.stages.cap_blocks import Image, Sensor
 from mushpipe.stages.cap_clod import CLOD_CHANCE, clods
 from mushpipe.stages.cap_decode import first_of_each
@@ -119,7 +121,7 @@ class CapFit(Stage):
             self._bridge(holes, fits, depth, camera, circles, order)
         found = self._kept(_locations(fits, source.astype(np.uint8)), _poses(fits), circles)
         self._edges.look(frame, found[-1], self.edge_offset_px)
-        return found
+        return *_beside_edges(*found[:2], self._edges.amiss_px, found[-1].radius), found[-1]
 
     def scores(
         self,
@@ -242,6 +244,21 @@ def _poses(fits: Fits) -> Poses:
         fitness=fits.fitness,
         valid=fits.valid,
     )
+
+
+def _beside_edges(
+    locations: Locations, poses: Poses, amiss_px: float, radius: Floats
+) -> tuple[Locations, Poses]:
+    """Return both with wider sigmas where edges in depth are off by so much, of caps so large, px.
+
+    A rim that is off by a share of its radius is a diameter off by that, and a tilt by `LEVER`.
+    """
+    if not amiss_px:
+        return locations, poses
+    share = amiss_px / radius
+    size = np.hypot(locations.sigma_diameter, share * locations.diameter)
+    tilt = np.hypot(poses.sigma_rad, LEVER * share)
+    return replace(locations, sigma_diameter=size), replace(poses, sigma_rad=tilt)
 
 
 def _sigma_tilt(fits: Fits) -> Floats:

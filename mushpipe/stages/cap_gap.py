@@ -40,13 +40,18 @@ _LEAST_FALL = 0.06  # of luma
 
 
 class EdgeWatch:
-    """Looks at edges of caps until it can judge where depth shows them; tells what is amiss."""
+    """Looks at edges of caps until it can judge where depth shows them; tells what is amiss.
+
+    Attributes:
+        amiss_px: By how much that is, px; 0 where nothing is, or is known yet.
+    """
 
     def __init__(self) -> None:
         self._gaps: Floats | None = np.zeros((0, 3))  # None once they were judged
         self._seen = np.zeros((0, 2))  # centres of the circles that were looked at, px
         self._places = self._confirmed = 0
         self._frames = 0
+        self.amiss_px = 0.0
 
     def look(self, frame: RgbdFrame, circles: Circles, edge_offset_px: float) -> None:
         """Look at a frame; warn, once, where depth shows caps otherwise than colour.
@@ -76,6 +81,8 @@ class EdgeWatch:
         if found is None:
             return
         amiss = _tell(-found[0], edge_offset_px, (found[1], found[2]), 0 if enough else UNSURE)
+        if amiss:
+            self.amiss_px = float(np.hypot(np.hypot(*found[1:]), found[0] + edge_offset_px))
         if enough or amiss:
             self._gaps = None
 

@@ -97,6 +97,31 @@ def test_a_camera_that_shows_caps_wider_is_told_of_with_what_puts_it_right(
     assert abs(mended) < 0.6
 
 
+def test_sigmas_hold_where_edges_are_told_to_be_amiss() -> None:
+    """From the frame on that tells it; depth widened by 3 px makes diameters too large by more."""
+    watching, blind = CapFit(), CapFit()
+    blind._edges._gaps = None  # as if it had judged, and found nothing
+    diameter, tilt = {True: list[float](), False: list[float]()}, list[float]()
+    for frame, circles in beds("moving"):
+        seen = widened(frame, 3)
+        truth = read_truth(SIMULATED / "moving.mcap")
+        caps = truth.frames[truth.place(frame.header)].caps
+        sigmas = []
+        for stage in (watching, blind):
+            found, poses, kept = stage.process(seen, circles)
+            away = np.linalg.norm(caps.center[:, None] - kept.center, axis=2)
+            row, near = away.argmin(axis=0), away.min(axis=0) < 3
+            error = found.diameter[near] - caps.diameter[row[near]]
+            diameter[stage is watching].extend((error / found.sigma_diameter[near]) ** 2)
+            sigmas.append(poses.sigma_rad)
+        if watching._edges.amiss_px:
+            tilt.extend(sigmas[0] - sigmas[1])
+    assert watching._edges.amiss_px > 1.5
+    assert np.nanmean(diameter[False]) > 1.5
+    assert np.nanmean(diameter[True]) < 1
+    assert np.nanmin(tilt) > 0
+
+
 def test_a_setting_for_another_camera_is_told_of(caplog: pytest.LogCaptureFixture) -> None:
     (message,), bias = told(CapFit(edge_offset_px=-2.5), 1, caplog)
     assert "edge_offset_px: -2.5 takes them for 2.5 px outside" in message
