@@ -251,12 +251,13 @@ def _beside_edges(
 ) -> tuple[Locations, Poses]:
     """Return both with wider sigmas where edges in depth are off by so much, of caps so large, px.
 
-    A rim that is off by a share of its radius is a diameter off by that, and a tilt by `LEVER`.
+    Where a rim is off by a share of its radius, a tilt is by `LEVER` of that; of a diameter the
+    outline in colour holds half.
     """
     if not amiss_px:
         return locations, poses
     share = amiss_px / radius
-    size = np.hypot(locations.sigma_diameter, share * locations.diameter)
+    size = np.hypot(locations.sigma_diameter, share * locations.diameter / 2)
     tilt = np.hypot(poses.sigma_rad, LEVER * share)
     return replace(locations, sigma_diameter=size), replace(poses, sigma_rad=tilt)
 
