@@ -7,6 +7,7 @@ import json
 import sys
 from collections.abc import Iterator, Sequence
 from enum import StrEnum
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -71,20 +72,18 @@ def _out(text: str) -> None:
 
 def _version(asked: bool) -> None:
     if asked:
-        from importlib.metadata import version
-
         _out(f"mushpipe {version('mushpipe')}")
         raise typer.Exit()
 
 
 @app.callback()
 def _program(
-    version: Annotated[
+    asked: Annotated[
         bool,
         typer.Option("--version", callback=_version, is_eager=True, help="show it and end"),
     ] = False,
 ) -> None:
-    del version  # `_version` has looked at it
+    del asked  # `_version` has looked at it
 
 
 def _compile(

@@ -70,13 +70,13 @@ def files_read(plan: Plan) -> tuple[Path, ...]:
         StageError: The source's ``files`` failed.
         PluginError: It gave no paths.
     """
-    code = (node.use.rpartition(":")[0] for node in plan.nodes if in_file(node.use))
-    read = (node.plugin.path_settings(written=False) for node in plan.nodes)
-    given = (path for paths in read for path in paths.values())
     graph = Path(plan.file)
+    uses = (node.use for node in plan.nodes if in_file(node.use))
+    code = (graph.parent / use.rpartition(":")[0] for use in uses)
+    settings = (node.plugin.path_settings(written=False) for node in plan.nodes)
+    given = (path for paths in settings for path in paths.values())
     inside = (path for node in plan.nodes for path in node.read)
-    code_files = (graph.parent / file for file in code)
-    return (graph, *code_files, *given, *inside, *files_of(plan.source))
+    return (graph, *code, *given, *inside, *files_of(plan.source))
 
 
 def files_of(node: Node, run: RunInfo | None = None) -> tuple[Path, ...]:

@@ -276,16 +276,12 @@ def _node(
     if in_file(use):
         use = str(real(base / from_home(use)))
     attributes = settings_of(plugin_class)
-    paths = {
-        key: str(value)
-        for key, value in settings.items()
-        if isinstance(getattr(plugin, attributes.get(key, key), None), Path)
-    }
+    meant = {key: getattr(plugin, attributes.get(key, key), None) for key in settings}
+    paths = {key: str(settings[key]) for key, value in meant.items() if isinstance(value, Path)}
     read = tuple(
-        (Path.cwd() if key in shell else document.base) / from_home(value)
-        for key, value in settings.items()
-        if isinstance(value, str)
-        and isinstance(getattr(plugin, attributes.get(key, key), None), Transform)
+        (Path.cwd() if key in shell else document.base) / from_home(settings[key])
+        for key, value in meant.items()
+        if isinstance(value, Transform) and isinstance(settings[key], str)
     )
     return Node(str(at[-1]), kind, use, plugin, ports, dict(inputs), delivery, {}, paths, read)
 
