@@ -126,7 +126,7 @@ def run(
 ) -> None:
     """Run a graph on its source, or on another one given by --source."""
     from mushpipe.console import NOT_AGAIN, execute, set_up_logging, stderr
-    from mushpipe.core.manifest import manifest_path
+    from mushpipe.core.manifest import manifest_of, manifest_path
 
     set_up_logging(verbose)
     flags = {"max_frames": frames, "start": start, "end": end, "speed": speed, "loop": loop}
@@ -138,7 +138,7 @@ def run(
     more = ["foxglove"] if foxglove else []
     plan = _compile(graph, [*overrides, *(set_ or [])], source, more)
     repeated = graph.suffix == ".mcap" and source is None  # its frame is saved already
-    beside = graph.with_suffix(".run.json") if repeated else manifest_path(plan)
+    beside = manifest_of(graph) if repeated else manifest_path(plan)
     report = execute(plan, manifest or beside, None if repeated else capsules)
     if repeated and report.processed and report.exit_code == 0:
         stderr.print(NOT_AGAIN, style="yellow")

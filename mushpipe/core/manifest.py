@@ -67,5 +67,13 @@ def manifest_path(plan: Plan) -> Path:
     for node in plan.sinks:
         for path in files_of(node, info):
             if path.is_file() or not path.exists():  # not beside a device such as /dev/null
-                return path.with_suffix(".run.json")
+                return manifest_of(path)
     return Path("run.json")
+
+
+def manifest_of(path: Path) -> Path:
+    """Return where the manifest goes of the run that writes or repeats a file.
+
+    The whole name is kept: ``bed.mcap`` and ``bed.rrd`` may be of two runs.
+    """
+    return path.with_name(f"{path.name}.run.json")

@@ -43,7 +43,7 @@ def test_run_writes_results_and_manifest_and_prints_the_balance(folder: Path) ->
     assert done.stdout == ""
     assert "3 frames in = 3 processed + 0 dropped + 0 failed" in done.stderr
     assert "p95 ms" in done.stderr
-    manifest = json.loads((folder / "out.run.json").read_text())
+    manifest = json.loads((folder / "out.mcap.run.json").read_text())
     assert manifest["graph"]["stages"]["open"] == {"use": "opening", "size": 10}
     assert manifest["result"]["frames"] == {
         "in": 3,
@@ -60,7 +60,7 @@ def test_run_says_how_many_mushrooms_it_found(folder: Path) -> None:
     number = sum(len(json.loads(line)["picks"]) for line in exported)
     assert number > 10
     assert f"mushrooms: {number} in 3 frames, {number / 3:.1f} a frame" in done.stderr
-    result = json.loads((folder / "out.run.json").read_text())["result"]
+    result = json.loads((folder / "out.mcap.run.json").read_text())["result"]
     assert result["found"] == {"rows": number, "frames": 3, "empty": 0}
     none = ("--set", "detect.radius_px=[200,210]")
     done = mushpipe("run", "graph.yaml", *none, cwd=folder)
@@ -69,12 +69,25 @@ def test_run_says_how_many_mushrooms_it_found(folder: Path) -> None:
 
 def test_a_run_that_never_began_leaves_the_manifest_of_the_one_before(folder: Path) -> None:
     mushpipe("run", "graph.yaml", cwd=folder)
-    before = (folder / "out.run.json").read_bytes()
+    before = (folder / "out.mcap.run.json").read_bytes()
     (folder / "recordings").mkdir()
     done = mushpipe("run", "graph.yaml", "--source", "recordings", cwd=folder)
     assert done.returncode == EXIT_DAMAGED
-    assert (folder / "out.run.json").read_bytes() == before
+    assert (folder / "out.mcap.run.json").read_bytes() == before
     assert "manifest:" not in done.stderr
+
+
+def test_results_of_one_stem_have_a_manifest_each(folder: Path) -> None:
+    (folder / "graph.yaml").write_text(GRAPH.replace("path: out.mcap", "path: a.mcap"))
+    mushpipe("run", "graph.yaml", cwd=folder)
+    look = GRAPH.replace("log: {use: mcap, path: out.mcap}", "look: {use: rerun, save: a.rrd}")
+    (folder / "graph.yaml").write_text(look)
+    mushpipe("run", "graph.yaml", cwd=folder)
+    sinks = [
+        [*json.loads((folder / f"{name}.run.json").read_text())["graph"]["sinks"]]
+        for name in ("a.mcap", "a.rrd")
+    ]
+    assert sinks == [["log"], ["look"]]
 
 
 def test_export_prints_one_json_line_per_frame(folder: Path) -> None:

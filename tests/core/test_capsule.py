@@ -72,7 +72,7 @@ def test_the_program_repeats_the_failure(lab: Lab, graph: str, monkeypatch, caps
     assert cli(monkeypatch, "run", "failures/failure-rich-b-2.mcap") == 1
     error = first[first.index("error: ") :]
     assert capsys.readouterr().err.endswith(error)
-    names = ["failure-rich-b-2.mcap", "failure-rich-b-2.run.json"]  # the capsule and its run
+    names = ["failure-rich-b-2.mcap", "failure-rich-b-2.mcap.run.json"]  # the capsule and its run
     assert sorted(path.name for path in (lab.folder / "failures").iterdir()) == names
 
 

@@ -183,7 +183,7 @@ def test_the_manifest_stands_beside_the_first_result(lab: Lab, graph: str):
     assert manifest_path(lab.compile(graph)) == Path("run.json")
     wanted = lab.folder / "deep" / "{recording}.results.mcap"
     plan = lab.compile(graph.replace("collect", "writes"), f"out.path={wanted}")
-    assert manifest_path(plan) == lab.folder / "deep" / "bed.results.run.json"
+    assert manifest_path(plan) == lab.folder / "deep" / "bed.results.mcap.run.json"
     assert (lab.folder / "deep").is_dir()
 
 
