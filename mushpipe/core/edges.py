@@ -27,7 +27,6 @@ READ_AHEAD = 2
 SINK_QUEUE = 4
 LEAP_NS = 60 * 10**9
 
-
 # as numpy says it: to what is written into an array, and to what changes one in place
 _READ_ONLY = ("assignment destination is read-only", "output array is read-only")
 
@@ -146,7 +145,8 @@ def paced(frames: Iterator[RgbdFrame], speed: float, stop: threading.Event) -> I
                 logger.warning(text, (stamp_ns - last_ns) / 1e9, frame.header.sequence)
         elif speed:
             due = first[1] + (stamp_ns - first[0]) / 1e9 / speed
-            if stop.wait(max(0.0, due - time.monotonic())):
+            wait_s = min(max(0.0, due - time.monotonic()), threading.TIMEOUT_MAX)
+            if stop.wait(wait_s):
                 return
         last_ns = stamp_ns
         yield frame

@@ -100,7 +100,7 @@ class Source(Plugin):
 
     max_frames: int | None = Field(None, ge=1, lt=2**63, description="stop after so many frames")
     max_seconds: float | None = Field(
-        None, gt=0, description="stop after so many seconds, by the stamps of the frames"
+        None, gt=0, le=1e9, description="stop after so many seconds, by the stamps of the frames"
     )
 
     @property

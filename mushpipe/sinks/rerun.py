@@ -34,6 +34,7 @@ from mushpipe.sinks.rerun_server import (
 
 logger = logging.getLogger("mushpipe")
 LIVE_IMAGE_HZ = 5.0
+SLOWEST_HZ = 1e-6  # once in eleven days
 # On a full disk the SDK's writer dies, and whoever waits for it hangs (0.41), even at the end of
 # the program. So the sink ends before that.
 ROOM_BYTES = 64_000_000
@@ -64,11 +65,13 @@ class RerunSink(Sink):
     )
     memory: str = Field("1GB", description="what the viewer or server of `spawn` and `serve` keeps")
     image_hz: float | None = Field(
-        None, gt=0, description="most images per second; not set: 5 of a live run, all of a replay"
+        None,
+        ge=SLOWEST_HZ,
+        description="most images per second; not set: 5 of a live run, all of a replay",
     )
     result_hz: float | None = Field(
         None,
-        gt=0,
+        ge=SLOWEST_HZ,
         description="most results per second; not set: all. As many as images, and each frame "
         "that is shown is shown whole",
     )

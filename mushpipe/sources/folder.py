@@ -44,7 +44,7 @@ class ImagesSource(ReplaySource):
         None, gt=0, description="metres per unit of depth: 0.001 where a unit is a millimetre"
     )
     camera: Intrinsics | None = Field(None, description="intrinsics of the colour images")
-    fps: float = Field(30, gt=0, le=1000, description="frames per second")
+    fps: float = Field(30, ge=1e-6, le=1000, description="frames per second")
 
     _found: list[tuple[Path, Path | None]] = PrivateAttr(default_factory=list)
     _counts: Counter[str] = PrivateAttr(default_factory=Counter)

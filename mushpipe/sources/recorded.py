@@ -56,7 +56,10 @@ class RecordedSource(Source):
         None, gt=0, description="metres per unit of depth, where the recording does not say it"
     )
     pair_tolerance_ms: float = Field(
-        15.0, ge=0, description="largest difference of the stamps of a colour and a depth image"
+        15.0,
+        ge=0,
+        le=1e9,
+        description="largest difference of the stamps of a colour and a depth image",
     )
     camera: Intrinsics | None = Field(
         None, description="intrinsics, in place of those of the recording"

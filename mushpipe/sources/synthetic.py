@@ -26,7 +26,7 @@ class SyntheticSource(SceneSettings, ReplaySource):
     """
 
     max_frames: int | None = Field(10, ge=1, lt=2**63, description="number of frames")
-    fps: float = Field(30, gt=0, le=1000, description="frames per second")
+    fps: float = Field(30, ge=1e-6, le=1000, description="frames per second")
     step_mm: float = Field(
         0, ge=0, le=100, description="way of the gantry along x from frame to frame, mm"
     )
@@ -35,7 +35,7 @@ class SyntheticSource(SceneSettings, ReplaySource):
     )
     missing_depth: int | None = Field(None, ge=2, description="every so many-th frame has no depth")
     gap_after: int | None = Field(None, ge=1, description="frames before a gap in time")
-    gap_s: float = Field(2, ge=0, description="length of the gap, s")
+    gap_s: float = Field(2, ge=0, le=1e6, description="length of the gap, s")
     color: ColorCamera = Field(ColorCamera(), description="the colour camera")
     sensor: DepthSensor = Field(DepthSensor(), description="the depth camera")
 

@@ -412,13 +412,24 @@ def test_names_that_cannot_be_are_told_in_words(
         (["run", "graph.yaml", "--frames", str(2**63)], "max_frames of 'mcap'"),
         (["run", "graph.yaml", "--source", "a.mcap", "--end", "1e300"], "end of 'mcap'"),
         (["run", "graph.yaml", "--set", "pick.memory_s=1e300"], "memory_s of 'picks'"),
+        (["run", "graph.yaml", "--set", "source.max_seconds=1e300"], "max_seconds of 'mcap'"),
+        (["run", "graph.yaml", "--set", "source.pair_tolerance_ms=1e308"], "pair_tolerance_ms of"),
+        (["run", "look.yaml", "--set", "look.image_hz=1e-300"], "image_hz of 'rerun'"),
+        (["run", "look.yaml", "--set", "look.result_hz=1e-300"], "result_hz of 'rerun'"),
+        (["run", "images.yaml", "--set", "source.fps=1e-300"], "fps of 'images'"),
+        (["run", "made.yaml", "--set", "source.fps=1e-300"], "fps of 'synthetic'"),
+        (["run", "made.yaml", "--set", "source.gap_s=1e300"], "gap_s of 'synthetic'"),
         (["bench", "graph.yaml", "--frames", str(2**63)], "Invalid value for '--frames'"),
     ],
 )
-def test_a_number_that_is_too_large_is_the_command_lines_fault(
+def test_a_number_that_is_too_large_or_too_small_is_the_command_lines_fault(
     folder: Path, arguments: list[str], message: str
 ) -> None:
-    """It was an OverflowError, told as a failure of the source or the stage."""
+    """It was an OverflowError, told as a failure of the source, the stage or the sink."""
+    played = {"images": "{use: images, path: .}", "made": "{use: synthetic}"}
+    for name, source in played.items():
+        (folder / f"{name}.yaml").write_text(f"mushpipe: 1\nsource: {source}\n")
+    (folder / "look.yaml").write_text(GRAPH + "  look: {use: rerun, save: out.rrd}\n")
     done = mushpipe(*arguments, cwd=folder)
     assert message in done.stderr
     assert done.returncode == EXIT_USAGE

@@ -271,6 +271,12 @@ def test_pace_stops_while_it_waits():
     assert len(list(paced((make_frame(i) for i in range(9)), 1e9, stop))) == 2
 
 
+def test_a_pace_may_be_slower_than_a_clock_can_count():
+    stop = threading.Event()
+    threading.Timer(0.05, stop.set).start()
+    assert len(list(paced((make_frame(i) for i in range(3)), 1e-300, stop))) == 1
+
+
 def test_a_replay_at_a_pace_gives_the_same_frames(lab: Lab):
     lab.run(lab.chain("threshold"), "source.speed=1000000000.0")
     assert [trace.frame.header.sequence for trace in lab.seen] == [0, 1, 2]
