@@ -229,7 +229,6 @@ def schema(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="file to write")] = None,
 ) -> None:
     """Print the JSON Schema of graph files, for completion in an editor."""
-    from mushpipe.core.errors import MushpipeError
     from mushpipe.core.overwriting import require_writable
     from mushpipe.core.plugins import load_registry
     from mushpipe.core.schema import graph_schema
@@ -238,11 +237,8 @@ def schema(
     text = json.dumps(graph_schema(load_registry()), indent=2)
     if out is None:
         _out(text)
-        return
-    try:
+    else:
         out.write_text(text + "\n")
-    except OSError as error:
-        raise MushpipeError(f"{out}: cannot be written: {error.strerror}") from error
 
 
 @plugins_app.command("list")
@@ -278,9 +274,11 @@ register_proof(app)
 
 def main() -> None:
     """Entry point: errors meant for the user become one message and an exit code."""
+    from mushpipe.core.closed import open_closed
     from mushpipe.core.errors import EXIT_INTERRUPTED, MushpipeError
     from mushpipe.core.interrupt import watch
 
+    open_closed()
     faulthandler.enable(file=2)  # where native code of a plugin crashes, which one it was
     try:
         watch()

@@ -132,6 +132,18 @@ def test_standard_output_is_for_one_sink(recorded: Path) -> None:
     assert "sink 'again' would write to standard output beside sink 'log'" in done.stderr
 
 
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
+def test_what_is_printed_gets_into_no_file_where_a_shell_closed_the_stream(
+    recorded: Path, closed: str
+) -> None:
+    shell = ["sh", "-c", f'exec "$@" {closed}', "sh"]
+    run = ("run", "graph.yaml", "--source", "a.mcap", "--set", "log.path=./b.mcap")
+    for arguments in (run, ("export", "b.mcap")):
+        done = subprocess.run([*shell, *MAIN, *arguments], cwd=recorded, capture_output=True)
+        assert (done.returncode, b"Traceback" in done.stderr) == (0, False)
+    assert mushpipe("info", "b.mcap", cwd=recorded).returncode == 0
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
