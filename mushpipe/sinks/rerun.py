@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import shutil
 import signal
 import subprocess
 from collections import deque
 from io import FileIO
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from mushpipe import Header, RunInfo, Sink, Trace
 from mushpipe.core.errors import DependencyError, UsageError
@@ -38,6 +40,7 @@ SLOWEST_HZ = 1e-6  # once in eleven days
 # On a full disk the SDK's writer dies, and whoever waits for it hangs (0.41), even at the end of
 # the program. So the sink ends before that.
 ROOM_BYTES = 64_000_000
+_MEMORY = re.compile(r"\d+(\.\d+)? ?[kMGT]i?B|(100|\d?\d)%")  # as Rerun reads it
 
 
 class RerunSink(Sink):
@@ -93,6 +96,22 @@ class RerunSink(Sink):
     _memories: tuple[Remembering, Remembering] | None = PrivateAttr(None)  # images, results
     _last: Header | None = PrivateAttr(None)
     _base: Transform | None = PrivateAttr(None)
+
+    @field_validator("host")
+    @classmethod
+    def _address(cls, value: str) -> str:
+        try:
+            ip_address(value)
+        except ValueError:
+            raise ValueError("expected an IP address of this machine: 127.0.0.1, say") from None
+        return value
+
+    @field_validator("memory")
+    @classmethod
+    def _amount(cls, value: str) -> str:
+        if not _MEMORY.fullmatch(value):
+            raise ValueError("expected an amount (300MB, 2GB), or a share of all there is (50%)")
+        return value
 
     @model_validator(mode="after")
     def _has_a_target(self) -> RerunSink:

@@ -65,6 +65,9 @@ def start(host: str, port: int, *arguments: str) -> subprocess.Popen[bytes]:
         if server.poll() is not None or time.monotonic() > deadline:
             with suppress(ProcessLookupError):  # it may have ended by itself
                 os.killpg(server.pid, signal.SIGKILL)
-            raise DependencyError(f"Rerun does not start on {host}:{port}")
+            raise DependencyError(
+                f"Rerun does not start on {host}:{port}: is {host} (host) an address of this "
+                "machine?"
+            )
         time.sleep(0.05)
     return server

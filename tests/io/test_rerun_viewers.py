@@ -152,6 +152,27 @@ def test_what_cannot_be_opened_is_refused_with_a_reason(monkeypatch: pytest.Monk
             feed(sink, [])
 
 
+@pytest.mark.parametrize(
+    ("setting", "value", "message"),
+    [
+        ("memory", "lots", r"expected an amount \(300MB, 2GB\), or a share"),
+        ("memory", "1gb", "expected an amount"),
+        ("memory", "150%", "expected an amount"),
+        ("host", "localhost", "expected an IP address of this machine"),
+    ],
+)
+def test_what_rerun_would_not_start_with_is_a_fault_of_its_setting(
+    setting: str, value: str, message: str
+) -> None:
+    with pytest.raises(ValidationError, match=rf"{setting}\n.*{message}"):
+        RerunSink.model_validate({"serve": 9876, setting: value})
+
+
+@pytest.mark.parametrize("memory", ["1GB", "1.5 GiB", "300MB", "50%", "0kB"])
+def test_rerun_starts_with_any_amount_of_memory_that_is_accepted(memory: str) -> None:
+    feed(RerunSink(serve=free_port(), memory=memory), [])
+
+
 def test_it_takes_only_the_newest_frame_when_live_and_can_be_closed_twice(tmp_path: Path) -> None:
     sink = RerunSink(save=tmp_path / "{recording}.rrd")
     assert sink.delivery == "latest"
