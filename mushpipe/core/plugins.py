@@ -26,7 +26,7 @@ from pluggy import PluginValidationError
 
 from mushpipe.core.errors import DependencyError, PluginError, suggest
 from mushpipe.core.paths import from_home, real
-from mushpipe.core.stage import Kind, Plugin, kind_of
+from mushpipe.core.stage import Kind, Plugin, require_kind
 
 logger = logging.getLogger("mushpipe")
 
@@ -75,8 +75,7 @@ class Entry:
             raise
         except (Exception, SystemExit) as error:
             raise PluginError(f"{where} cannot be imported: {_brief(error)}") from error
-        if kind_of(plugin) != self.kind:
-            raise PluginError(f"{where} is a {kind_of(plugin)}, not a {self.kind}")
+        require_kind(plugin, self.kind, where)
         return plugin
 
 
@@ -136,8 +135,7 @@ class Registry:
         """
         if in_file(use):
             plugin = class_in_file(use, base)
-            if kind_of(plugin) != kind:
-                raise PluginError(f"{use} is a {kind_of(plugin)}, not a {kind}")
+            require_kind(plugin, kind, use)
             return plugin
         distribution, _, name = use.rpartition(":")
         found = [

@@ -186,3 +186,13 @@ def kind_of(plugin: type) -> Kind:
             return kind
     name = plugin.__qualname__ if isinstance(plugin, type) else repr(plugin)
     raise PluginError(f"{name} is not a Stage, Source or Sink class")
+
+
+def require_kind(plugin: type, kind: Kind, called: str) -> None:
+    """Raise PluginError, which says how a graph calls the class, where it is none of a kind."""
+    try:
+        found = kind_of(plugin)
+    except PluginError as error:
+        raise PluginError(f"{called}: {error}") from error
+    if found != kind:
+        raise PluginError(f"{called} is a {found}, not a {kind}")

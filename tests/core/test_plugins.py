@@ -262,7 +262,7 @@ def test_an_entry_point_without_a_distribution():
     [
         ("no_such.module:X", "cannot be imported: ModuleNotFoundError: No module named 'no_such'"),
         ("mushpipe.builtin:X", "cannot be imported: AttributeError: module 'mushpipe.builtin' has"),
-        ("mushpipe.builtin:Registry", "Registry is not a Stage"),
+        ("mushpipe.builtin:Registry", "stage 'x' of this process: Registry is not a Stage, Source"),
         ("mushpipe.builtin:hookimpl", "is not a Stage, Source or Sink class"),
         (Frames, "stage 'x' of this process is a source, not a stage"),
     ],
@@ -323,8 +323,8 @@ def test_a_file_is_loaded_once_so_that_its_types_agree(lab: Lab):
         ("", "mine.py:Mine", "{file} has no class 'Mine'; none is known here"),
         ("1 / 0", "mine.py:X", "{file} cannot be imported: ZeroDivisionError: division by zero"),
         ("exit(3)", "mine.py:X", "{file} cannot be imported: SystemExit: 3"),
-        ("X = 5", "mine.py:X", "5 is not a Stage, Source or Sink class"),
-        (FILE, "mine.py:Mask", "Mask is not a Stage, Source or Sink"),
+        ("X = 5", "mine.py:X", "mine.py:X: 5 is not a Stage, Source or Sink class"),
+        (FILE, "mine.py:Mask", "mine.py:Mask: Mask is not a Stage, Source or Sink"),
     ],
 )
 def test_a_file_that_cannot_be_used(lab: Lab, code, use, message):
