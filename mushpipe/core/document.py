@@ -69,8 +69,8 @@ class Document:
         return {path[len(at)] for path in self.overrides if path[: len(at)] == at != path}
 
 
-def read_document(path: Path) -> Document:
-    """Read a YAML file.
+def read_document(path: Path, example: str = "mushpipe: 1") -> Document:
+    """Read a YAML file, which must hold a mapping; what such a one is like is the `example`.
 
     Raises:
         GraphError: It is missing, not UTF-8, not YAML, not a mapping, has a key twice, a tag
@@ -86,10 +86,10 @@ def read_document(path: Path) -> Document:
         raise GraphError([Problem(str(path), len(before), len(before[-1]) + 1, message)]) from error
     except OSError as error:
         raise GraphError([Problem(str(path), 0, 0, f"cannot be read: {error}")]) from error
-    return parse_document(text, str(path), path.parent)
+    return parse_document(text, str(path), path.parent, example)
 
 
-def parse_document(text: str, file: str, base: Path) -> Document:
+def parse_document(text: str, file: str, base: Path, example: str = "mushpipe: 1") -> Document:
     """Parse YAML text; see `read_document`."""
     document = Document(file, base, lines=text.splitlines())
     try:
@@ -113,7 +113,7 @@ def parse_document(text: str, file: str, base: Path) -> Document:
     builder = _Builder(document)
     data = builder.build(root, ()) if root else None
     if not builder.problems and not isinstance(data, dict):
-        builder.problems.append(Problem(file, 1, 1, "expected a mapping such as 'mushpipe: 1'"))
+        builder.problems.append(Problem(file, 1, 1, f"expected a mapping such as '{example}'"))
     if builder.problems or not isinstance(data, dict):
         raise GraphError(builder.problems)
     document.data = data

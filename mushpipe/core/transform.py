@@ -121,7 +121,8 @@ def _read(value: Any, info: ValidationInfo) -> Any:
 
     path = resolve_path(Path(value), info)
     try:
-        return Transform.model_validate_json(json.dumps(read_document(path).data), strict=True)
+        data = read_document(path, "frame: robot_base").data
+        return Transform.model_validate_json(json.dumps(data), strict=True)
     except (GraphError, ValueError) as error:
         what = str(error)
         if isinstance(error, ValidationError):

@@ -69,7 +69,7 @@ class DepthCorrect(Stage):
 
     def _read(self, path: Path) -> tuple[float, float, float]:
         try:
-            found = DepthCorrect.model_validate(read_document(path).data)
+            found = DepthCorrect.model_validate(read_document(path, "offset_mm: 2.85").data)
             if found.calibration is not None:
                 raise ValueError("it names another file")
         except (GraphError, ValueError) as error:

@@ -51,9 +51,11 @@ def test_a_file_means_the_same_as_its_content(tmp_path: Path) -> None:
         ("[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]", "or matrix; expected frame, translation"),
         ("missing.yaml", "missing.yaml: there is no such file"),
         ("bad.yaml", "expected frame, translation"),
+        ("list.yaml", "list.yaml:1:1: expected a mapping such as 'frame: robot_base'; expected fr"),
     ],
 )
 def test_faults_are_reported_where_they_stand(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "list.yaml").write_text("[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]\n")
     (tmp_path / "bad.yaml").write_text("frame: base\ntranslation: [1, 2]\n")
     with pytest.raises(GraphError, match=r"T_base_camera|fame") as caught:
         setting(tmp_path, text)
