@@ -65,6 +65,15 @@ def written_settings(plugin: Plugin) -> dict[str, Any]:
     return plugin.model_dump(mode="json", by_alias=True, round_trip=True)
 
 
+def told(error: Exception) -> str:
+    """Return an error in one line, the first of pydantic's with its place: ``frame: Field ...``."""
+    if not isinstance(error, ValidationError):
+        return str(error)
+    first = error.errors()[0]
+    place, message = ".".join(map(str, first["loc"])), first["msg"].removeprefix("Value error, ")
+    return f"{place}: {message}" if place else message
+
+
 def writing_fault(plugin: Plugin) -> str:
     """Say why the settings, written out, would not be the same when read; nothing if they would.
 
@@ -76,10 +85,10 @@ def writing_fault(plugin: Plugin) -> str:
         rewritten = written_settings(again)
     except ValidationError as error:
         first = error.errors()[0]
-        name = ".".join(map(str, first["loc"]))
         if first["type"] == "extra_forbidden":
+            name = ".".join(map(str, first["loc"]))
             return f"'{name}' is a name for writing alone; an 'alias' is one for both"
-        return f"{name}: {first['msg']}"
+        return told(error)
     except Exception as error:  # of types that are no data, and of a plugin's own serializers
         return str(error)
     changed = [name for name, value in written.items() if rewritten.get(name) != value]

@@ -19,6 +19,7 @@ from pydantic import (
 from mushpipe.core.arrays import Floats
 from mushpipe.core.group import Group
 from mushpipe.core.paths import resolve_path
+from mushpipe.core.settings import told
 
 UNIT_TOLERANCE = 1e-3
 _EXPECTED = "frame, translation: [x, y, z] in m and quaternion: [x, y, z, w]"
@@ -124,13 +125,7 @@ def _read(value: Any, info: ValidationInfo) -> Any:
         data = read_document(path, "frame: robot_base").data
         return Transform.model_validate_json(json.dumps(data), strict=True)
     except (GraphError, ValueError) as error:
-        what = str(error)
-        if isinstance(error, ValidationError):
-            first = error.errors(include_url=False)[0]
-            what = (
-                f"{'.'.join(map(str, first['loc']))}: {first['msg'].removeprefix('Value error, ')}"
-            )
-        raise ValueError(f"no transform in {path}: {what}; expected {_EXPECTED}") from error
+        raise ValueError(f"no transform in {path}: {told(error)}; expected {_EXPECTED}") from error
 
 
 TransformSetting = Annotated[

@@ -16,6 +16,7 @@ from mushpipe.core.arrays import Singles
 from mushpipe.core.document import read_document
 from mushpipe.core.errors import GraphError
 from mushpipe.core.jit import jit
+from mushpipe.core.settings import told
 from mushpipe.core.types import end_of_scale
 from mushpipe.stages.warm_up import example_frame
 
@@ -73,7 +74,7 @@ class DepthCorrect(Stage):
             if found.calibration is not None:
                 raise ValueError("it names another file")
         except (GraphError, ValueError) as error:
-            raise InputError(f"{path}: no calibration of depth: {error}") from error
+            raise InputError(f"{path}: no calibration of depth: {told(error)}") from error
         return found._errors
 
     def process(self, frame: RgbdFrame) -> RgbdFrame:

@@ -179,9 +179,14 @@ def test_a_heap_is_no_plane(tmp_path: Path) -> None:
 
 
 def test_a_calibration_that_is_none_is_refused(tmp_path: Path) -> None:
-    for text in ("offset: 3\n", "offset_mm: far\n", "calibration: x.yaml\n"):
+    for text, fault in (
+        ("offset: 3\n", "offset: Extra inputs are not permitted$"),
+        ("offset_mm: far\n", "offset_mm: Input should be a valid number"),
+        ("calibration: x.yaml\n", "it names another file$"),
+        ("[3, 0, 0]\n", "expected a mapping such as 'offset_mm: 2.85'$"),
+    ):
         (tmp_path / "bad.yaml").write_text(text)
-        with pytest.raises(InputError, match=r"bad\.yaml: no calibration of depth"):
+        with pytest.raises(InputError, match=rf"bad\.yaml: no calibration of depth: .*{fault}"):
             DepthCorrect(calibration=tmp_path / "bad.yaml").open()
     with pytest.raises(InputError, match="there is no such file"):
         DepthCorrect(calibration=tmp_path / "none.yaml").open()
