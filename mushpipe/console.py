@@ -19,8 +19,8 @@ from rich.logging import RichHandler
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from mushpipe.core.edges import files_read
 from mushpipe.core.errors import EXIT_INTERRUPTED
+from mushpipe.core.files import files_read
 from mushpipe.core.overwriting import require_writable, spare
 from mushpipe.core.plan import Plan
 from mushpipe.core.report import RunReport
@@ -99,8 +99,7 @@ def execute(
 ) -> RunReport:
     """Run a plan in front of a user; no ``manifest`` or ``capsules`` where None, ``size`` above."""
     spare(manifest, *files_read(plan))
-    if manifest is not None and manifest.parent.exists():
-        require_writable(manifest)
+    require_writable(manifest, with_folder=True)
     stop = threading.Event()
     with interruptible(stop), progress_bar(size) as show:
         report = run(plan, stop, show, capsules)

@@ -102,11 +102,10 @@ def _compile(settings: dict[str, Any], overrides: list[Any], source: str) -> Pla
 
 def _files(plan: Plan) -> list[Path]:
     """Return the files of the recording that exist."""
-    from mushpipe.core.edges import recording_of
-    from mushpipe.core.stage import RunInfo, Sink
+    from mushpipe.core.files import files_of, recording_of
+    from mushpipe.core.stage import RunInfo
 
-    sink = plan.sinks[0].plugin
-    files = sink.files(RunInfo(recording_of(plan.source), {})) if isinstance(sink, Sink) else ()
+    files = files_of(plan.sinks[0], RunInfo(recording_of(plan.source), {}))
     return [path for path in files if path.is_file()]
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from mushpipe.core.document import Document
-from mushpipe.core.edges import recording_of
 from mushpipe.core.errors import UsageError
+from mushpipe.core.files import recording_of
 from mushpipe.core.plan import Node, Plan
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.recording import GRAPH, RecordingReader

@@ -10,14 +10,13 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from itertools import islice
-from pathlib import Path
 from typing import Any
 
 from mushpipe.core.doubts import judged
-from mushpipe.core.errors import MushpipeError, PluginError, StageError
+from mushpipe.core.errors import MushpipeError, StageError
 from mushpipe.core.mailbox import Mailbox
-from mushpipe.core.plan import Node, Plan
-from mushpipe.core.plugins import in_file, prints_aside
+from mushpipe.core.plan import Node
+from mushpipe.core.plugins import prints_aside
 from mushpipe.core.report import Durations, SinkReport
 from mushpipe.core.stage import Plugin, ReplaySource, RunInfo, Sink, Source, Stage
 from mushpipe.core.types import RgbdFrame
@@ -60,62 +59,6 @@ def named(node: Node, method: str) -> Iterator[None]:
 def plain(value: object) -> Any:
     """Return what a plugin says of itself as data of JSON; numbers of numpy become plain ones."""
     return json.loads(json.dumps(value, default=lambda v: getattr(v, "tolist", v.__str__)()))
-
-
-def files_read(plan: Plan) -> tuple[Path, ...]:
-    """Return what a run reads: its graph, what its source plays, models, and plugins in files.
-
-    Raises:
-        StageError: The source's ``files`` failed.
-        PluginError: It gave no paths.
-    """
-    graph = Path(plan.file)
-    uses = (node.use for node in plan.nodes if in_file(node.use))
-    code = (graph.parent / use.rpartition(":")[0] for use in uses)
-    settings = (node.plugin.path_settings(written=False) for node in plan.nodes)
-    given = (path for paths in settings for path in paths.values())
-    inside = (path for node in plan.nodes for path in node.read)
-    return (graph, *code, *given, *inside, *files_of(plan.source))
-
-
-def files_of(node: Node, run: RunInfo | None = None) -> tuple[Path, ...]:
-    """Return the files that a source reads, or that a sink writes in a run.
-
-    Raises:
-        StageError: The plugin's ``files`` failed.
-        PluginError: It gave no paths.
-    """
-    plugin = node.plugin
-    found: object = ()
-    with named(node, "files"):
-        if isinstance(plugin, Source):
-            found = plugin.files()
-        elif isinstance(plugin, Sink) and run is not None:
-            found = plugin.files(run)
-    if not isinstance(found, tuple | list) or not all(isinstance(path, Path) for path in found):
-        raise PluginError(
-            f"{node.kind} '{node.name}' ({node.use}): its files() gave {found!r}, expected a "
-            "tuple of paths"
-        )
-    return tuple(found)
-
-
-def recording_of(node: Node) -> str:
-    """Return the name of what a source plays, for file names.
-
-    Raises:
-        StageError: The source's ``name`` failed.
-        PluginError: It gave no text.
-    """
-    found: object = ""
-    with named(node, "name"):
-        if isinstance(node.plugin, Source):
-            found = node.plugin.name()
-    if not isinstance(found, str):
-        raise PluginError(
-            f"{node.kind} '{node.name}' ({node.use}): its name() gave {found!r}, expected text"
-        )
-    return found
 
 
 def limited(frames: Iterator[RgbdFrame], source: Source) -> Iterator[RgbdFrame]:

@@ -14,8 +14,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from mushpipe.core.document import Document, Location
 from mushpipe.core.errors import GraphError, PluginError, Problem, UsageError, suggest
 from mushpipe.core.faults import faults_of
+from mushpipe.core.files import files_of
 from mushpipe.core.overrides import apply_override, encoding_fault
-from mushpipe.core.overwriting import same_file
+from mushpipe.core.overwriting import clashes
 from mushpipe.core.paths import from_home, real
 from mushpipe.core.plan import Node, Plan
 from mushpipe.core.plugins import Registry, in_file
@@ -27,7 +28,7 @@ from mushpipe.core.settings import (
     settings_of,
     writing_fault,
 )
-from mushpipe.core.stage import Kind, Plugin, RunInfo, Sink, Source
+from mushpipe.core.stage import Kind, Plugin, RunInfo, Source
 from mushpipe.core.transform import Transform
 from mushpipe.core.wire import BASE_TOPIC, RESULT_PREFIX, TIMING_TOPIC, TOTAL
 from mushpipe.core.wiring import wire
@@ -196,37 +197,23 @@ def _check_names(
     return problems
 
 
-class _Named(RunInfo):
-    """A run of which nothing is known yet: paths keep their braces, and no folder is made."""
-
-    def path(self, template: Path) -> Path:
-        """Return a path as it stands."""
-        return template
-
-
 def _check_files(document: Document, nodes: list[Node]) -> list[Problem]:
     """Return which sinks would write over what is read, or over one another's file.
 
     Other ways to one file are found by a run.
     """
     problems: list[Problem] = []
-    taken: list[tuple[Path, str]] = []
     streams = [node.name for node in nodes if node.plugin.streams()]
     for name in streams[1:]:
         message = f"sink '{name}' would write to standard output beside sink '{streams[0]}'"
         problems.append(document.problem(("sinks", name), message, key=True))
+    files: dict[str, tuple[Path, ...]] = {}
     for node in nodes:
-        files: tuple[Path, ...] = ()
         with suppress(Exception):  # of a plugin, whose fault a run tells of
-            if isinstance(node.plugin, Source):
-                taken = [(Path(path), "what is read") for path in node.plugin.files()]
-            if isinstance(node.plugin, Sink):
-                files = tuple(map(Path, node.plugin.files(_Named("", {}))))
-        for path in files:
-            if others := [name for other, name in taken if same_file(path, other)]:
-                message = f"sink '{node.name}' would write over {others[0]}, {path}"
-                problems.append(document.problem(("sinks", node.name), message, key=True))
-        taken += [(path, f"the file of sink '{node.name}'") for path in files]
+            files[node.name] = files_of(node, RunInfo("{recording}", {}))
+    read = files.pop(nodes[0].name, ())
+    for name, harm in clashes(read, files):
+        problems.append(document.problem(("sinks", name), f"sink '{name}' {harm}", key=True))
     return problems
 
 

@@ -8,8 +8,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from mushpipe.core.edges import files_of, recording_of
 from mushpipe.core.errors import InputError
+from mushpipe.core.files import files_of, recording_of
 from mushpipe.core.plan import Plan
 from mushpipe.core.stage import RunInfo
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from io import FileIO
 from pathlib import Path
 
@@ -30,13 +30,17 @@ def spare(out: Path | None, *read: Path) -> None:
             raise UsageError(f"{out} is what is read, and would be written over: give another name")
 
 
-def require_writable(out: Path | None) -> None:
+def require_writable(out: Path | None, with_folder: bool = False) -> None:
     """Find out before any work that its outcome cannot be written; touches nothing.
+
+    Args:
+        out: The file to write; None writes nothing.
+        with_folder: Whether its folder will be made where there is none.
 
     Raises:
         UsageError: No file can be written at `out`.
     """
-    if out is not None and (fault := _fault(out)):
+    if out is not None and (fault := _fault(out, with_folder)):
         raise UsageError(f"{out} cannot be written: {fault}")
 
 
@@ -79,23 +83,34 @@ def spare_files(read: Iterable[Path], written: Mapping[str, Iterable[Path]]) -> 
     Raises:
         UsageError: A sink would write over what is read or another sink's file, or cannot write.
     """
-    taken = [("what the run reads,", path) for path in read]
+    for name, harm in clashes(read, written):
+        raise UsageError(f"sink '{name}' {harm}")
+    for name, paths in written.items():
+        for path in paths:
+            if fault := _fault(path, with_folder=True):
+                raise UsageError(f"sink '{name}': {path} cannot be written: {fault}")
+
+
+def clashes(
+    read: Iterable[Path], written: Mapping[str, Iterable[Path]]
+) -> Iterator[tuple[str, str]]:
+    """Yield each sink with a file that is read or another sink's, and what it would do to it."""
+    taken = [("what is read", path) for path in read]
     for name, paths in written.items():
         for path in paths:
             for whose, other in taken:
                 if same_file(path, other):
-                    raise UsageError(f"sink '{name}' would write over {whose} {path}")
-            if fault := _fault(path):
-                raise UsageError(f"sink '{name}': {path} cannot be written: {fault}")
-        taken += [(f"the file of sink '{name}',", path) for path in paths]
+                    yield name, f"would write over {whose}, {path}"
+                    break
+        taken += [(f"the file of sink '{name}'", path) for path in paths]
 
 
-def _fault(path: Path) -> str:
+def _fault(path: Path, with_folder: bool) -> str:
     """Return why no file can be written at a path, "" where one can."""
     if path.is_dir():
         return "it is a folder"
     if not path.parent.is_dir():
-        return f"there is no folder {path.parent}"
+        return _folder_fault(path.parent) if with_folder else f"there is no folder {path.parent}"
     if not os.access(path if path.exists() else path.parent, os.W_OK):
         return "permission denied"
     if path.is_file():
@@ -104,3 +119,11 @@ def _fault(path: Path) -> str:
         except UsageError:
             return "another run is writing it; give another name"
     return ""
+
+
+def _folder_fault(folder: Path) -> str:
+    """Return why no folder can be made, "" where one can."""
+    above = next(each for each in (folder, *folder.parents) if os.path.lexists(each))
+    if not above.is_dir():
+        return f"{above} is no folder"
+    return "" if os.access(above, os.W_OK) else f"permission denied in {above}"

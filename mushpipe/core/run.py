@@ -16,16 +16,14 @@ from mushpipe.core.edges import (
     SinkThread,
     SourceThread,
     failure,
-    files_of,
-    files_read,
     interruptible_opening,
     named,
     opened,
     opener,
     plain,
-    recording_of,
 )
 from mushpipe.core.errors import InputError, MushpipeError, StageError
+from mushpipe.core.files import files_of, files_read, recording_of
 from mushpipe.core.manifest import build_manifest
 from mushpipe.core.overwriting import spare_files
 from mushpipe.core.plan import Node, Plan

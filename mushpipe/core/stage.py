@@ -40,9 +40,13 @@ class RunInfo:
         Raises:
             UsageError: There can be no such folder.
         """
-        path = Path(str(template).replace("{recording}", self.recording))
+        path = self.filled(template)
         make_folder(path.parent)
         return path
+
+    def filled(self, template: Path) -> Path:
+        """Fill ``{recording}`` into a path, of which nothing has to be there."""
+        return Path(str(template).replace("{recording}", self.recording))
 
 
 class Plugin(Group):

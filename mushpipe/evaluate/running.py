@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mushpipe.core.document import read_document
-from mushpipe.core.edges import recording_of
 from mushpipe.core.errors import UsageError
+from mushpipe.core.files import files_of, recording_of
 from mushpipe.core.graph import compile_document
 from mushpipe.core.paths import require_listed
 from mushpipe.core.plan import Plan
 from mushpipe.core.plugins import Registry, load_registry
 from mushpipe.core.report import RunReport
-from mushpipe.core.stage import RunInfo, Sink
+from mushpipe.core.stage import RunInfo
 
 _NO_BRACES = str.maketrans("{}", "()")
 
@@ -125,10 +125,7 @@ def plan_for(
 
 def result_path(plan: Plan) -> Path:
     """Return the file that a plan made by `plan_for` writes."""
-    sink = plan.sinks[0].plugin
-    if not isinstance(sink, Sink):
-        raise TypeError("the plan has no sink")
-    return sink.files(RunInfo(recording_of(plan.source), {}))[0]
+    return files_of(plan.sinks[0], RunInfo(recording_of(plan.source), {}))[0]
 
 
 def slug(alternative: Alternative) -> str:

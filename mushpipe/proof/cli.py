@@ -112,8 +112,8 @@ def bench(
 
     from mushpipe.console import set_up_logging
     from mushpipe.core.document import read_document
-    from mushpipe.core.edges import files_read
     from mushpipe.core.errors import EXIT_DIFFERS
+    from mushpipe.core.files import files_read
     from mushpipe.core.graph import compile_document
     from mushpipe.core.overwriting import require_writable, spare
     from mushpipe.core.plugins import load_registry

@@ -105,7 +105,7 @@ def test_the_pose_of_the_camera_is_not_written_over(recorded: Path) -> None:
     )
     done = mushpipe("run", "own.yaml", cwd=recorded)
     assert done.returncode == EXIT_USAGE
-    assert "sink 'log' would write over what the run reads" in done.stderr
+    assert "sink 'log' would write over what is read, " in done.stderr
     assert (recorded / "camera.yaml").read_text() == mount
 
 
@@ -149,7 +149,7 @@ def test_what_is_printed_gets_into_no_file_where_a_shell_closed_the_stream(
     [
         (("--set", "log.path=."), "it names no file"),
         (("--set", "log.path=$OUT/x.mcap"), "$OUT is not filled in here"),
-        (("--set", "log.path=graph.yaml/x.mcap"), "graph.yaml cannot be a folder: File exists"),
+        (("--set", "log.path=graph.yaml/x.mcap"), "graph.yaml is no folder"),
         (("--source", ""), "--source is empty"),
     ],
 )
@@ -241,6 +241,36 @@ def test_results_are_kept_where_another_sink_cannot_open(
     assert done.returncode == EXIT_USAGE
     assert message.format(folder=folder) in done.stderr
     assert (folder / "out.mcap").read_text() == "of yesterday"
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--source", "none.mcap"),
+        ("--set", "detect.use=./fails.py:Fails"),
+        ("--set", "other.port=5005"),
+        ("--set", "again.path=deep/er/out.mcap"),
+    ],
+    ids=lambda options: options[1],
+)
+def test_no_folder_is_made_where_a_run_cannot_begin(folder: Path, options: tuple[str, ...]) -> None:
+    text = (folder / "graph.yaml").read_text()
+    others = "  other: {use: robot-json, port: 0, replay: false}\n"
+    others += "  again: {use: mcap, path: other/out.mcap}\n"
+    (folder / "graph.yaml").write_text(text + others)
+    (folder / "fails.py").write_text(
+        "from mushpipe import Circles, Mask, RgbdFrame, Stage\n\n"
+        "class Fails(Stage):\n"
+        "    def open(self) -> None:\n"
+        "        raise OSError('no weights')\n"
+        "    def process(self, frame: RgbdFrame, mask: Mask) -> Circles:\n"
+        "        raise NotImplementedError\n"
+    )
+    before = {*folder.iterdir()}
+    path = ("--set", "log.path=deep/er/out.mcap")
+    done = mushpipe("run", "graph.yaml", *path, *options, cwd=folder)
+    assert done.returncode != 0
+    assert {*folder.iterdir()} == before, done.stderr
 
 
 @pytest.mark.parametrize(
