@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 from collections.abc import Iterable, Iterator, Mapping
@@ -60,10 +61,15 @@ def opened_alone(path: Path) -> FileIO:
     """Open a file to write, made if need be and not emptied, that no other run is to write.
 
     Raises:
-        UsageError: Another run is writing it.
+        UsageError: Another run is writing it, or it is a pipe that nobody reads.
         OSError: It cannot be opened.
     """
-    file = FileIO(path, "ab")
+    try:
+        file = FileIO(path, "ab", opener=_open_at_once)
+    except OSError as error:
+        if error.errno != errno.ENXIO:
+            raise
+        raise UsageError(f"{path} is a pipe that nobody reads: start first what does") from error
     try:
         if path.is_file():  # a device such as /dev/null is for everybody
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -71,6 +77,13 @@ def opened_alone(path: Path) -> FileIO:
         file.close()
         raise UsageError(f"{path} is being written by another run: give another name") from error
     return file
+
+
+def _open_at_once(path: str, flags: int) -> int:
+    """Open a file; a pipe that nobody reads is an error, where `open` alone waits for ever."""
+    number = os.open(path, flags | os.O_NONBLOCK, 0o666)
+    os.set_blocking(number, True)
+    return number
 
 
 def spare_files(read: Iterable[Path], written: Mapping[str, Iterable[Path]]) -> None:

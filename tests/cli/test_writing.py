@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from mushpipe.sinks.mcap import McapSink
 from mushpipe.sinks.rerun import RerunSink
 from tests.cli.shell import MAIN, ROOT, mushpipe
 from tests.io.values import make_frame, record, trace_of
+
+ROBOT = "{use: robot-json, port: 0, replay: true, transcript: p}"
 
 
 @pytest.fixture
@@ -241,6 +244,23 @@ def test_results_are_kept_where_another_sink_cannot_open(
     assert done.returncode == EXIT_USAGE
     assert message.format(folder=folder) in done.stderr
     assert (folder / "out.mcap").read_text() == "of yesterday"
+
+
+@pytest.mark.parametrize(
+    "sink", ["{use: mcap, path: p}", "{use: rerun, save: p}", ROBOT], ids=lambda text: text[6:10]
+)
+def test_a_pipe_is_written_where_somebody_reads_it(recorded: Path, sink: str) -> None:
+    text = (recorded / "graph.yaml").read_text()
+    (recorded / "graph.yaml").write_text(text + f"  piped: {sink}\n")
+    os.mkfifo(recorded / "p")
+    run = ("run", "graph.yaml", "--source", "a.mcap")
+    done = mushpipe(*run, cwd=recorded)
+    assert done.returncode == EXIT_USAGE
+    assert "p is a pipe that nobody reads: start first what does" in done.stderr
+    with subprocess.Popen(["timeout", "60", "cp", "p", "read"], cwd=recorded):
+        done = mushpipe(*run, cwd=recorded)
+        assert done.returncode == 0, done.stderr
+    assert (recorded / "read").stat().st_size > 100
 
 
 @pytest.mark.parametrize(
