@@ -41,9 +41,19 @@ _DEPTH: dict[str, tuple[str, float | None]] = {
 }
 # models in which an angle is a distance from the centre: no pinhole even with coefficients of zero
 _FISHEYE = ("equidistant", "kannala_brandt", "fisheye")
+_COMPRESSED_DEPTH = "compressedDepth"
 _PNG = b"\x89PNG"
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _ROS1_NAME = re.compile(rb"^(float64\[\d*\] +)([DKRP])\b", re.MULTILINE)
+
+
+def kind_of(message: Any) -> str:
+    """Return whether an image is ``color`` or ``depth``; "" of what does not say it."""
+    stated = getattr(message, "format", "")  # of a compressed one: "rgb8; jpeg compressed bgr8"
+    encoding = getattr(message, "encoding", "") or stated.partition(";")[0]
+    if encoding in _DEPTH or _COMPRESSED_DEPTH in stated:
+        return "depth"
+    return "color" if encoding in (*_COLOR, *_YUV, "jpeg", "jpg") else ""
 
 
 def _pixels(message: Any, item: int) -> Bytes:

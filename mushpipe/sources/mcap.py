@@ -16,6 +16,7 @@ from mushpipe.core.paths import GraphPath
 from mushpipe.core.recording import GRAPH, MANIFEST, Index, RecordingReader
 from mushpipe.core.stage import ReplaySource
 from mushpipe.core.types import RgbdFrame
+from mushpipe.sources.kinds import require_kind
 from mushpipe.sources.playing import Player, beside_of
 from mushpipe.sources.recorded import NO_CAMERA, NO_DEPTH, RecordedSource
 from mushpipe.sources.topics import Topics, choose_topics, untold_images
@@ -66,6 +67,8 @@ class McapSource(RecordedSource, ReplaySource):
         index = reader.index()
         if not index.counts and reader.damage:
             raise InputError(f"{self.path}: {'; '.join(reader.damage)}; nothing could be read")
+        require_kind(reader, index, "color", self.color_topic)
+        require_kind(reader, index, "depth", self.depth_topic)
         named = (self.color_topic, self.depth_topic, self.camera_topic)
         return index, choose_topics(index, self.path, *named, self.use_depth)
 

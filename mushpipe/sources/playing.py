@@ -9,17 +9,15 @@ from dataclasses import dataclass, replace
 from itertools import starmap
 from typing import Any, TypeVar
 
-from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoders
-from mcap_ros2.decoder import DecoderFactory as Ros2Decoders
-
 from mushpipe.core import wire
 from mushpipe.core.arrays import Bytes
 from mushpipe.core.errors import InputError
 from mushpipe.core.geometry import Camera
-from mushpipe.core.recording import CONVERT, ZSTD, Raw
+from mushpipe.core.recording import Raw
 from mushpipe.core.types import Header, RgbdFrame
 from mushpipe.sources.calibration import Calibration, Recorded
-from mushpipe.sources.images import decode_color, decode_depth, with_ros2_names
+from mushpipe.sources.decoding import Decoder
+from mushpipe.sources.images import decode_color, decode_depth
 from mushpipe.sources.pairing import Pairing
 from mushpipe.sources.recorded import RecordedSource
 from mushpipe.sources.topics import Topics, says_aligned
@@ -27,10 +25,6 @@ from mushpipe.sources.topics import Topics, says_aligned
 T = TypeVar("T")
 logger = logging.getLogger("mushpipe")
 MOST_BESIDE = 256  # frames of which something waits that was recorded beside them
-_COMPRESSED = (
-    "each message is compressed (ros2 bag record --compression-mode message): "
-    f"{CONVERT.format('ITS_FOLDER')} unpacks them"
-)
 _ALIGN = (
     "depth must be aligned to colour; record aligned_depth_to_color, or play without depth: "
     "--set source.use_depth=false"
@@ -74,7 +68,7 @@ class Player:
         self.frames = 0
         self._first: tuple[int, ...] | None = None  # size of the first image
         self._size: tuple[int, ...] | None = None  # of the last
-        self._factories = (ProtobufDecoders(), Ros2Decoders())
+        self._decoder = Decoder()
         self._warned: set[str] = set()
         self._last: _Color | None = None
         self._found_beside: dict[tuple[int, int], dict[str, wire.Message]] = {}
@@ -179,20 +173,7 @@ class Player:
     ) -> T | None:
         """Decode a message, or return None and count it where ``what`` says as what."""
         try:
-            if raw.message.data.startswith(ZSTD):  # no message begins so, CDR begins with 0
-                raise ValueError(_COMPRESSED)
-            if raw.schema and not raw.schema.data:  # it would be decoded to nothing
-                raise ValueError(f"the file lacks the definition of {raw.schema.name}")
-            schema = with_ros2_names(raw.schema)
-            for factory in self._factories:
-                decoder = factory.decoder_for(raw.channel.message_encoding, schema)
-                if decoder is not None:
-                    return decode(decoder(raw.message.data), raw)
-            raise ValueError(
-                f"message encoding '{raw.channel.message_encoding}' with schema encoding "
-                f"'{schema.encoding if schema else ''}' is not supported (supported: cdr with "
-                "ros2msg, protobuf with protobuf)"
-            )
+            return decode(self._decoder.decode(raw), raw)
         except Exception as error:  # whatever a decoder makes of foreign bytes
             if what:
                 self.counts[f"{what} that could not be decoded"] += 1

@@ -57,7 +57,7 @@ def choose_topics(
     for wanted, kinds in ((color, IMAGES), (depth, IMAGES), (camera, CALIBRATIONS)):
         if wanted is not None:
             _check_named(index, path, wanted, kinds)
-    images = _images(index)
+    images = images_of(index)
     color = color or _one(path, "color", _colors([t for t in images if t != depth]))
     if color is None:
         known = (t if index.counts[t] else f"{t} without a message" for t in sorted(index.channels))
@@ -132,10 +132,10 @@ def _depths(images: list[str]) -> list[str]:
 
 def untold_images(index: Index, color: str) -> list[str]:
     """Return the topics of other images whose names do not say of what: depth may be one."""
-    return [t for t in _images(index) if not _kind(t) and _base(t) != _base(color)]
+    return [t for t in images_of(index) if not _kind(t) and _base(t) != _base(color)]
 
 
-def _images(index: Index) -> list[str]:
+def images_of(index: Index) -> list[str]:
     """Return the topics of images; of one that is there raw and compressed the fuller."""
     best: dict[str, str] = {}
     for topic in _topics(index, IMAGES):

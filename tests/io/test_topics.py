@@ -10,6 +10,7 @@ from mcap.writer import Writer as McapWriter
 
 from mushpipe.core.errors import InputError
 from mushpipe.core.types import RgbdFrame
+from mushpipe.sources.mcap import McapSource
 from tests.io.bags import (
     ALIGNED,
     CAMERA,
@@ -200,6 +201,33 @@ def test_a_named_topic_of_another_type_is_refused(
     text = refusal(tmp_path, rgbd([0]), **{f"{role}_topic": topic})
     kind = "Image" if topic == COLOR else "CameraInfo"
     assert text.startswith(f"topic '{topic}' holds sensor_msgs/msg/{kind}, expected {expected}")
+
+
+@pytest.mark.parametrize(
+    ("role", "topic", "said"),
+    [
+        ("depth", COLOR, f"holds colour, expected depth; --set source.depth_topic={ALIGNED}"),
+        ("color", ALIGNED, f"holds depth, expected colour; --set source.color_topic={COLOR}"),
+    ],
+)
+def test_of_a_topic_that_holds_the_other_kind_the_right_one_is_told(
+    role: str, topic: str, said: str, tmp_path: Path
+) -> None:
+    text = refusal(tmp_path / "raw", rgbd([0]), **{f"{role}_topic": topic})
+    assert text == f"topic '{topic}' {said}"
+    jpeg = compressed(encoded(color_pixels(), ".jpg"), "rgb8; jpeg compressed bgr8")
+    png = compressed(depth_png(depth_pixels()), "16UC1; compressedDepth png")
+    entries = [(COLOR, T0, jpeg), (ALIGNED, T0 + 1, png)]
+    assert refusal(tmp_path / "small", entries, **{f"{role}_topic": topic}) == text
+    with pytest.raises(InputError, match=f"topic '{topic}' {said}"):  # before any sink opens
+        McapSource.model_validate(
+            {"path": tmp_path / "raw/bag/bag.mcap", f"{role}_topic": topic}
+        ).open()
+
+
+def test_where_no_topic_holds_depth_it_is_said(tmp_path: Path) -> None:
+    text = refusal(tmp_path, [color_at(0)], depth_topic=COLOR)
+    assert text == f"topic '{COLOR}' holds colour, expected depth; no topic holds depth"
 
 
 def test_unaligned_depth_is_refused_with_a_way_out(tmp_path: Path) -> None:
