@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from enum import IntEnum
@@ -44,10 +45,10 @@ class Verdict:
 
     @property
     def f(self) -> float:
-        """F of this frame; 1 where there was nothing and nothing was found."""
-        found, wrong = len(self.matching.truth), len(self.matching.missed)
-        wrong += len(self.matching.false)
-        return 2 * found / (2 * found + wrong) if found + wrong else 1.0
+        """F of this frame; NaN where there is nothing to find."""
+        found, missed = len(self.matching.truth), len(self.matching.missed)
+        rows = 2 * found + missed + len(self.matching.false)
+        return 2 * found / rows if found + missed else math.nan
 
 
 def judge(

@@ -29,7 +29,7 @@ def quantities_of(events: Events) -> dict[str, Floats]:
     result = {
         "precision": np.where(events.kind == Kind.MISSED, np.nan, found),
         "recall": np.where(events.kind == Kind.FALSE, np.nan, found),
-        "f": found.astype(float),
+        "f": np.where(events.kind == Kind.FALSE, -1.0, found),
         "radius": events.radius - events.true_radius,
         "diameter": 1e3 * (events.diameter - events.true_diameter),
         **_vector("center", ("u", "v"), events.center - events.true_center),

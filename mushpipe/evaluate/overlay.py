@@ -24,12 +24,17 @@ _JPEG_QUALITY = 82
 
 
 def worst(verdicts: Sequence[Verdict], most: int) -> list[Verdict]:
-    """Return the frames with the lowest F, and of those alike the largest errors of the centre."""
+    """Return the frames in which most is wrong: by share (1 - F), by number, by errors of centres.
 
-    def rank(verdict: Verdict) -> tuple[float, float]:
+    Of two frames that are alike in one the next decides.
+    """
+
+    def rank(verdict: Verdict) -> tuple[float, int, float]:
         m = verdict.matching
         error = verdict.detections.center[m.found] - verdict.truth.caps.center[m.truth]
-        return verdict.f, -float(np.linalg.norm(error, axis=1).mean()) if len(error) else 0.0
+        distance = float(np.linalg.norm(error, axis=1).mean()) if len(error) else 0.0
+        wrong = len(m.missed) + len(m.false)
+        return -wrong / max(1, wrong + 2 * len(m.truth)), -wrong, -distance
 
     return sorted(verdicts, key=rank)[:most]
 

@@ -236,7 +236,7 @@ def _worst(section: Section) -> str:
 def _frame(verdict: Verdict, frame: RgbdFrame | None) -> str:
     m = verdict.matching
     at = f"{verdict.recording}, {verdict.place[0]} {verdict.place[1]}"
-    text = f"F {verdict.f:.3f}: {len(m.missed)} missed, {len(m.false)} false"
+    text = f"F {number(verdict.f, 3)}: {len(m.missed)} missed, {len(m.false)} false"
     if verdict.header is None:
         text += ", no answer"
     return (

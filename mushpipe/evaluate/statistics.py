@@ -63,10 +63,12 @@ def p95_abs(x: Floats, w: Floats) -> Floats:
 
 
 def dice(x: Floats, w: Floats) -> Floats:
-    """F: 2 found / (2 found + missed + false), of x = 1 where found, else 0."""
-    found, rows = w @ x, w.sum(axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(2 * found / (found + rows))
+    """F: 2 found / (2 found + missed + false), of x = 1 where found, 0 missed, -1 false.
+
+    Where there is nothing to find it is NaN: it would be 0, however much or little is false.
+    """
+    found, there, rows = w @ (x > 0), w @ (x >= 0), w.sum(axis=1)
+    return np.where(there > 0, 2 * found / np.maximum(found + rows, 1), np.nan)
 
 
 def evaluate(statistic: Statistic, x: Floats, w: Floats, units: Ints | None = None) -> Floats:

@@ -221,7 +221,7 @@ def test_empty_cases_invent_nothing(case: str) -> None:
     measured = measure(events_of(verdicts), len(verdicts), resamples=20)
     values = {name: value.value for name, value in measured.items()}
     expected = {
-        "no truth": (0.0, math.nan, 0.0),
+        "no truth": (0.0, math.nan, math.nan),
         "nothing found": (math.nan, 0.0, 0.0),
         "nothing matched": (0.0, 0.0, 0.0),
         "no frame": (math.nan, math.nan, math.nan),

@@ -11,7 +11,9 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 
+from mushpipe.core.errors import EXIT_DIFFERS
 from mushpipe.evaluate.events import events_of, judge
 from mushpipe.evaluate.plots import _against_tilt, _stated
 from mushpipe.evaluate.results import of_picks
@@ -89,11 +91,41 @@ def test_report_of_nothing_found(tmp_path: Path, truths: dict[int, Any]) -> None
     assert text.count("20 missed, 0 false") == 3
 
 
-def test_report_of_a_frame_with_nothing_in_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("false", [0, 1, 3])
+def test_of_a_bed_with_nothing_in_it_the_false_ones_tell_and_no_f(
+    tmp_path: Path, false: int
+) -> None:
+    empty, given = bed(0).take(slice(0, 0)), picks_of(bed(0).take(slice(0, false)))
+    results = write_results(tmp_path / "r.mcap", {0: given}, {0: empty})
+    shown = run(results, "--report", tmp_path / "report")
+    assert shown.exit_code == 0
+    row = next(line.split() for line in shown.stdout.splitlines() if line.startswith("r "))
+    assert row[:6] == ["r", "1", "0", "0", str(false), "0"]
+    assert row[6:9] == ["0.000" if false else "-", "-", "-"]
+    content = judged(results)
+    assert (metrics(content)["f"], metrics(content)["recall"]) == (None, None)
+    assert content["alternatives"][0]["overall"]["false"] == false
+    assert f"F -: 0 missed, {false} false" in (tmp_path / "report/index.html").read_text()
+    assert run(results, "--threshold", "f>=0").exit_code == EXIT_DIFFERS
+
+
+def test_what_is_false_on_an_empty_bed_counts_in_the_whole(tmp_path: Path) -> None:
+    """19 of 20 found, and 3 false ones on a bed with nothing in it."""
+    full, empty = bed(0), bed(1).take(slice(0, 0))
+    answers = {0: picks_of(full.take(slice(0, 19))), 1: picks_of(bed(1).take(slice(0, 3)))}
+    results = write_results(tmp_path / "r.mcap", answers, {0: full, 1: empty})
+    values = metrics(judged(results))
+    assert values["f"] == pytest.approx(2 * 19 / (2 * 19 + 1 + 3))
+    assert values["precision"] == pytest.approx(19 / 22)
+
+
+def test_the_worst_empty_bed_is_the_one_with_most_that_is_false(tmp_path: Path) -> None:
     empty = bed(0).take(slice(0, 0))
-    results = write_results(tmp_path / "r.mcap", {0: picks_of(empty)}, {0: empty})
-    assert run(results, "--report", tmp_path / "report").exit_code == 0
-    assert np.isnan(float(metrics(judged(results))["f"] or "nan"))
+    answers = {i: picks_of(bed(0).take(slice(0, false))) for i, false in enumerate([1, 0, 3, 2])}
+    results = write_results(tmp_path / "r.mcap", answers, dict.fromkeys(answers, empty))
+    run(results, "--report", tmp_path / "report")
+    text = (tmp_path / "report/index.html").read_text()
+    assert re.findall(r"F -: 0 missed, (\d) false", text) == ["3", "2", "1", "0"]
 
 
 def test_a_worst_frame_is_shown_on_its_own_image(tmp_path: Path) -> None:
