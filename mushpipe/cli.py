@@ -15,7 +15,7 @@ import typer
 
 from mushpipe.doctor import register as register_doctor
 from mushpipe.evaluate.cli import register as register_eval
-from mushpipe.options import file_argument
+from mushpipe.options import file_argument, source_overrides
 from mushpipe.output import Output, OutputOption
 from mushpipe.proof.cli import register as register_proof
 from mushpipe.record import register as register_record
@@ -129,14 +129,9 @@ def run(
     from mushpipe.core.manifest import manifest_of, manifest_path
 
     set_up_logging(verbose)
-    flags = {"max_frames": frames, "start": start, "end": end, "speed": speed, "loop": loop}
-    overrides: list[Any] = [
-        (f"source.{key}={value}", f"--{'frames' if key == 'max_frames' else key} {value}")
-        for key, value in flags.items()
-        if value is not None
-    ]
+    flags = source_overrides(frames=frames, start=start, end=end, speed=speed, loop=loop)
     more = ["foxglove"] if foxglove else []
-    plan = _compile(graph, [*overrides, *(set_ or [])], source, more)
+    plan = _compile(graph, [*flags, *(set_ or [])], source, more)
     repeated = graph.suffix == ".mcap" and source is None  # its frame is saved already
     beside = manifest_of(graph) if repeated else manifest_path(plan)
     report = execute(plan, manifest or beside, None if repeated else capsules)

@@ -33,3 +33,16 @@ def finite(value: float) -> float:
     if not math.isfinite(value):
         raise typer.BadParameter(f"{value} is no finite number")
     return value
+
+
+def source_overrides(**options: float | None) -> list[tuple[str, str]]:
+    """Return the overrides of options that set the source, each with the option it comes from.
+
+    ``frames=3`` is ``source.max_frames=3`` from ``--frames 3``.
+    """
+    settings = {"frames": "max_frames", "duration": "max_seconds"}
+    return [
+        (f"source.{settings.get(name, name)}={value}", f"--{name} {value}")
+        for name, value in options.items()
+        if value is not None
+    ]

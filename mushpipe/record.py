@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mushpipe.options import source_overrides
+
 if TYPE_CHECKING:
     from mushpipe.core.plan import Plan
     from mushpipe.core.report import RunReport
@@ -62,19 +64,14 @@ def record(
     from mushpipe.core.paths import STDIO
 
     set_up_logging(False)
-    limits = (("max_frames", "frames", frames), ("max_seconds", "duration", duration))
-    overrides: list[Any] = [
-        (f"source.{key}={value}", f"--{flag} {value}")
-        for key, flag, value in limits
-        if value is not None
-    ]
+    limits = source_overrides(frames=frames, duration=duration)
     # The sink looks once more: opening a camera takes time, in which another may have recorded it.
     settings = {"path": str(out), "timing": False, "overwrite": False}
     settings |= {"jpeg_quality": JPEG_QUALITY} if colour is Colour.jpeg else {}
     settings |= {"split_size": split_size} if split_size is not None else {}
     if out == STDIO and split_size is not None:
         raise UsageError("--split-size: a stream cannot be split")
-    plan = _compile(settings, [*overrides, *(set_ or [])], source)
+    plan = _compile(settings, [*limits, *(set_ or [])], source)
     for text in plan.warnings:
         logging.getLogger("mushpipe").warning(text)
     _refuse_to_overwrite(plan)

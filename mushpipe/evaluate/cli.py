@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mushpipe.options import file_argument, file_option, finite
+from mushpipe.options import file_argument, file_option, finite, source_overrides
 from mushpipe.output import Output, OutputOption
 
 if TYPE_CHECKING:
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from mushpipe.core.report import RunReport
     from mushpipe.evaluate.command import Request
     from mushpipe.evaluate.judging import Rules
-    from mushpipe.evaluate.running import Override
 
 
 TargetsArgument = Annotated[
@@ -133,14 +132,11 @@ def evaluate(
             frames=frames, topic=topic, out=out, report=report,
         )  # fmt: skip
         raise typer.Exit(_planes(targets, plane, threshold or [], rules, output))
-    overrides: list[Override] = [*(set_ or [])]
-    if frames is not None:
-        overrides.insert(0, (f"source.max_frames={frames}", f"--frames {frames}"))
     request = Request(
         targets=targets,
         truth=truth or [],
         recordings=recordings or [],
-        overrides=overrides,
+        overrides=[*source_overrides(frames=frames), *(set_ or [])],
         matrix=matrix or [],
         thresholds=threshold or [],
         topic=topic,
