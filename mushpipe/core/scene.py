@@ -10,7 +10,7 @@ import foxglove.messages as fox
 import numpy as np
 
 from mushpipe.core.arrays import Bytes, Floats, Rows
-from mushpipe.core.tables import Circles, DepthSource, PickFlag, Picks
+from mushpipe.core.tables import Circles, PickFlag, Picks
 from mushpipe.core.types import Header
 from mushpipe.core.wire import Message, foxglove_schema, timestamp
 
@@ -25,7 +25,7 @@ SOURCE_COLORS = np.array([RED, GREEN, AMBER], np.uint8)  # by DepthSource
 
 def in_order(picks: Picks) -> Rows:
     """Return the rows of the picks that have a position, in the order in which to pick."""
-    return np.flatnonzero(picks.source != DepthSource.MISSING)
+    return np.flatnonzero(~picks.missing)
 
 
 def posed(picks: Picks, rows: Rows) -> Rows:

@@ -183,10 +183,15 @@ class Locations(Columns):
     sigma_position: Floats = column(3)
     sigma_diameter: Floats = column()
 
+    @property
+    def missing(self) -> Bools:
+        """Whether there is no position, (N,)."""
+        return np.asarray(self.source == DepthSource.MISSING)
+
     def check(self) -> None:
         """A position is finite exactly where its source is not missing; sizes are positive."""
         self._require(self.source <= max(DepthSource), "the source must be a DepthSource")
-        present = self.source != DepthSource.MISSING
+        present = ~self.missing
         self._require(_known(self.position) == present, f"position {_EXACTLY}")
         self._require(np.isfinite(self.distance) == present, f"distance {_EXACTLY}")
         self._require(~(self.diameter <= 0), "the diameter must be positive or NaN")
@@ -272,11 +277,16 @@ class Picks(Columns):
     flags: NDArray[np.uint32] = column(dtype=np.uint32)
     frame_id: str = ""
 
+    @property
+    def missing(self) -> Bools:
+        """Whether there is no position, (N,)."""
+        return np.asarray(self.source == DepthSource.MISSING)
+
     def check(self) -> None:
         """Ids are unique, and a pick without depth carries no position."""
         self._require(first_of(self.id), "ids must be unique")
         self._require(self.source <= max(DepthSource), "the source must be a DepthSource")
-        present = self.source != DepthSource.MISSING
+        present = ~self.missing
         for name in ("position", "surface"):
             known = _known(getattr(self, name))
             self._require(known == present, f"{name} {_EXACTLY}")

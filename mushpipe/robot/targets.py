@@ -128,7 +128,7 @@ def _oriented(picks: Picks) -> Bools:
 
 def _no_depth(picks: Picks) -> Bools:
     flagged = (picks.flags & PickFlag.DEPTH_MISSING) != 0
-    return np.asarray(flagged | (picks.source == DepthSource.MISSING))
+    return np.asarray(flagged | picks.missing)
 
 
 def _estimated(picks: Picks) -> Bools:

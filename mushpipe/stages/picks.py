@@ -131,7 +131,7 @@ class MakePicks(Stage):
         locations, poses = locations.without(wrong), poses.without(wrong)
         poses = self._outward(poses, locations, frame.header.sequence)
         self._total += n
-        self._missing += int((locations.source == DepthSource.MISSING).sum())
+        self._missing += int(locations.missing.sum())
         height, width = frame.color.shape[:2]
         ids = self._tracks.update(
             circles,
@@ -182,9 +182,9 @@ class MakePicks(Stage):
         reach, tilt_sigma = circles.radius[:, None], np.radians(self.tilt_sigma_deg)
         cut = (circles.center < reach) | (circles.center + reach > np.array(image) - 1)
         flags = np.zeros(len(circles), np.uint32)
-        located, above = locations.source != DepthSource.MISSING, self._above(locations)
+        missing, above = locations.missing, self._above(locations)
         for flag, where in (
-            (PickFlag.DEPTH_MISSING, locations.source == DepthSource.MISSING),
+            (PickFlag.DEPTH_MISSING, missing),
             (PickFlag.DEPTH_ESTIMATED, locations.source == DepthSource.NEIGHBOURS),
             (PickFlag.POSE_UNKNOWN, ~poses.valid),
             (PickFlag.AT_BORDER, cut.any(axis=1)),
@@ -192,7 +192,7 @@ class MakePicks(Stage):
             (PickFlag.TILT_UNOBSERVABLE, poses.valid & ~(poses.sigma_rad < tilt_sigma)),
             (
                 PickFlag.TOO_CLOSE_TO_NEIGHBOUR,
-                located & ~(1000 * clearance(circles, locations, above) >= self.clearance_mm),
+                ~missing & ~(1000 * clearance(circles, locations, above) >= self.clearance_mm),
             ),
         ):
             flags[where] |= np.uint32(flag)
@@ -218,9 +218,8 @@ class MakePicks(Stage):
             "largest": -picks.diameter,
             "score": -picks.score,
         }
-        missing = picks.source == DepthSource.MISSING
         # the last key is the first to decide; NaN goes to the end
-        order = np.lexsort([picks.id, *(keys[name] for name in self.order[::-1]), missing])
+        order = np.lexsort([picks.id, *(keys[name] for name in self.order[::-1]), picks.missing])
         return np.asarray(order[keep[order]])
 
     def close(self) -> None:
@@ -265,7 +264,7 @@ def _joined(
     flags: NDArray[np.uint32],
     frame_id: str,
 ) -> Picks:
-    located = locations.source != DepthSource.MISSING
+    located = ~locations.missing
     return Picks(
         id=ids,
         center=circles.center,
