@@ -9,10 +9,11 @@ its own learns from such frames.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,16 +21,17 @@ from mushpipe import Circles, RgbdFrame
 from mushpipe.core.arrays import Bools, Floats
 from mushpipe.core.truth import Ignore, Truth
 from mushpipe.evaluate.matching import circle_iou
+from mushpipe.stages.cap_batch import Fits
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_kin import kin_of, unlike
+from mushpipe.stages.cap_kin import Kin, sure_of, tones_of, unlike
 from mushpipe.stages.cap_verify import BESIDE, FEW, FILE, FIT, MODELS, NAMES, features, flat
 from mushpipe.stages.phase_hough import PhaseHough
 from mushpipe.stages.phase_learned import seen_by
-from mushpipe.stages.verifier import LIMIT
+from mushpipe.stages.verifier import LIMIT, logistic, logit, weights_of
 from training.harder import harder
 from training.logistic import fit, write
 from training.matching import counted, matched
-from training.net.scenes import VERIFIER_SEED, varied_cases
+from training.net.scenes import SPARSE_SEED, VERIFIER_SEED, sparse_cases, varied_cases
 from training.scenes import Case, few_cases, more_cases, training_cases
 from training.verifier import NET, RADII, VARIED, segmentations
 
@@ -39,11 +41,13 @@ SETTINGS = [
     {"use_learned": net, "use_depth": deep} for deep in (True, False) for net in (False, True)
 ]
 OF_FEW = (FEW, FEW + BESIDE)
-SQUARED = ("misfit", "tilt", "aspect", "lean")  # for these
-# What they are asked about are caps by so much; a share of half, as in their training, loses caps
-# that a stereo camera shows badly, and 0.91, as in all scenes, keeps cups.
-SHARE = 0.85
+SQUARED = ("misfit", "tilt", "aspect", "lean", "stand")  # for these
+# What they are asked about are caps by so much; in their training they are by less, which would
+# lose caps that a stereo camera shows badly.
+SHARE = 0.6
+SPARSE = 160  # frames
 KNOWN = (FIT[0], "unlike", "learned")  # in some samples, and not in others
+Models = Mapping[str, dict[str, Any]]
 STAGES = [PhaseHough(radius_px=RADII, min_score=LEAST, **each) for each in SETTINGS]
 HEAD = """\
 # The verifier of the stage `cap-fit`: logistic regressions over what the fit found, over how like
@@ -75,38 +79,90 @@ def labels(circles: Circles, truth: Truth, stumps: bool = False) -> Floats:
     return np.where(neutral, np.nan, right.astype(np.float64))
 
 
-def samples(cases: Iterable[Case], stumps: bool = False) -> tuple[Floats, Floats]:
-    """Return features (N, F) and labels (N,) of all circles that a model decides about."""
+class Found(NamedTuple):
+    """Circles of one frame that the models decide about.
+
+    Attributes:
+        circles: As detected.
+        tones: (N, 3) as by `tones_of`.
+        fits: Of these circles, if the detector had depth.
+        seen: (N,) how far each is a circle of the network, if there was one.
+        label: (N,) as by `labels`.
+    """
+
+    circles: Circles
+    tones: Floats
+    fits: Fits | None
+    seen: Floats | None
+    label: Floats
+
+
+def found(cases: Iterable[Case], stumps: bool = False) -> Iterator[Found]:
+    """Yield what is found in the frames of cases, as they are and harder to see."""
     stage, rng = CapFit(), np.random.default_rng(7)
-    rows, right = [], []
     for case in cases:
         for frame in (case.frame, harder(case, rng).frame):
             if frame.camera is None or frame.depth is None:
                 continue
             for circles, deep, learned in detected(frame):
-                fits = stage.fit(frame.gray, frame.depth_m, frame.camera, circles) if deep else None
-                use = np.isfinite(label := labels(circles, case.truth, stumps))
-                other = unlike(kin_of(frame.color, circles))
-                seen = None if learned is None else seen_by(learned, circles)
-                if fits is not None:
-                    use &= fits.valid & ~flat(fits, circles.score, other, seen)
-                rows.append(features(circles, other, fits, seen)[use])
-                right.append(label[use])
+                yield Found(
+                    circles,
+                    tones_of(frame.color, circles),
+                    stage.fit(frame.gray, frame.depth_m, frame.camera, circles) if deep else None,
+                    None if learned is None else seen_by(learned, circles),
+                    labels(circles, case.truth, stumps),
+                )
+
+
+def samples(frames: Iterable[Found], lone: Models | None = None) -> tuple[Floats, Floats]:
+    """Return features (N, F) and labels (N,) of all circles that a model decides about.
+
+    Args:
+        frames: What was found.
+        lone: Models of lone circles, which say with the detector what is surely a cap; without
+            them every circle is a lone one.
+    """
+    rows, right = [], []
+    for circles, tones, fits, seen, label in frames:
+        other = np.full(len(circles), np.nan)
+        if lone is not None:
+            chance = None if fits is None else lone_of(circles, fits, seen, lone)
+            other = unlike(Kin(tones, sure_of(circles.score, chance)))
+        use = np.isfinite(label)
+        if fits is not None:
+            use &= fits.valid & ~flat(fits, circles.score, other, seen)
+        rows.append(features(circles, other, fits, seen)[use])
+        right.append(label[use])
     return np.concatenate(rows), np.concatenate(right)
+
+
+def lone_of(circles: Circles, fits: Fits, seen: Floats | None, lone: Models) -> Floats:
+    """Return what `lone_chances` does, of models that are not in the package yet."""
+    table = np.nan_to_num(features(circles, np.full(len(circles), np.nan), fits, seen))
+    weights = weights_of(lone[FEW if seen is None else FEW + BESIDE], NAMES)
+    return np.where(fits.valid, logistic(logit(table, weights)), circles.score)
 
 
 def teaches(rows: Floats, model: str) -> Bools:
     """Return which rows (N, F) teach a model: those of which it is asked.
 
-    What is fitted is for the models of fits, all else for those without; and what was found beside
-    the network for those beside it.
+    What is fitted is for the models of fits, all else for those without; what was found beside the
+    network for those beside it; and what looks like sure caps or not for those of no lone circles.
     """
     names = MODELS[model]
     fitted, alike, beside = np.isfinite(rows[:, [NAMES.index(name) for name in KNOWN]]).T
     use = (fitted == (FIT[0] in names)) & (beside == ("learned" in names))
-    if model in OF_FEW:
-        return np.asarray(use & ~alike)
-    return np.asarray(use & np.isfinite(rows[:, [NAMES.index(name) for name in names]]).all(axis=1))
+    return np.asarray(use & (alike == (model not in OF_FEW)))
+
+
+def taught(model: str, samples: tuple[Floats, Floats], ridge: float) -> dict[str, Any]:
+    """Return a model that has learnt from those samples of which it is asked."""
+    names, few = MODELS[model], model in OF_FEW
+    rows, right = (part[teaches(samples[0], model)] for part in samples)
+    print(f"{model}: {len(rows)} circles, {right.mean():.2f} right")
+    table = rows[:, [NAMES.index(name) for name in names]]
+    squared, share = (SQUARED, SHARE) if few else ((), None)
+    return fit(table, right, names, ridge, LIMIT, squared, share)
 
 
 def main() -> None:
@@ -116,20 +172,16 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(f"mushpipe/stages/{FILE}"))
     parser.add_argument("--ridge", type=float, default=1e-3)
     arguments = parser.parse_args()
-    cache = arguments.cache
+    cache, ridge = arguments.cache, arguments.ridge
     varied = varied_cases(cache, VERIFIER_SEED, "a", VARIED)
-    usual = samples(chain(training_cases(cache), more_cases(cache), varied))
-    few = samples(few_cases(cache), stumps=True)
-    all_of_them = tuple(map(np.concatenate, zip(usual, few, strict=True)))
-    models = {}
-    for model, names in MODELS.items():
-        chosen = (all_of_them, SQUARED, SHARE) if model in OF_FEW else (usual, (), None)
-        taught, squared, share = chosen
-        rows, right = (part[teaches(taught[0], model)] for part in taught)
-        table = rows[:, [NAMES.index(name) for name in names]]
-        models[model] = fit(table, right, names, arguments.ridge, LIMIT, squared, share)
-        print(f"{model}: {len(table)} circles, {right.mean():.2f} right")
-    write(models, arguments.out, HEAD)
+    sparse = sparse_cases(cache, SPARSE_SEED, "a", SPARSE)
+    usual = list(found(chain(training_cases(cache), more_cases(cache), varied)))
+    few = list(found(chain(few_cases(cache), sparse), stumps=True))
+    alone = samples([*few, *(frame for frame in usual if not len(sure_of(frame.circles.score)))])
+    lone = {model: taught(model, alone, ridge) for model in OF_FEW}
+    kin = samples([*usual, *few], lone)
+    others = {model: taught(model, kin, ridge) for model in MODELS if model not in OF_FEW}
+    write({model: (lone | others)[model] for model in MODELS}, arguments.out, HEAD)
 
 
 if __name__ == "__main__":

@@ -48,6 +48,7 @@ from mushpipe.stages.cap_model import (
 from mushpipe.stages.cap_regrow import beyond, slack
 from mushpipe.stages.cap_samples import ASTRAY, DIRECTIONS, ray_at
 from mushpipe.stages.cap_solve import ROUND, STAGES, Habit, refine, tilt
+from mushpipe.stages.cap_stand import stands
 from mushpipe.stages.cap_top import rise
 
 ROUNDNESS = 0.01  # in rim radii: how far the rim of a cap is from the circle of its area
@@ -82,6 +83,7 @@ class Fits:
         lines: (N,) number of rays along the outline in colour.
         misfit: (N,) mean squared residual, in sigmas.
         lean: (N,) rad, of the axis off the upright.
+        stand: (N,) m, how far the apex lies above the ground around; NaN where none is seen.
     """
 
     valid: Bools
@@ -101,6 +103,7 @@ class Fits:
     lines: Ints
     misfit: Floats
     lean: Floats
+    stand: Floats
 
 
 @borrower
@@ -259,12 +262,14 @@ def fit_caps(
         np.zeros((n, COUNTS)),
     )
     fit_all(frame, circles, rank, habit, settings, out)
-    return _fits(*out, np.array(habit.up))
+    up = np.array(habit.up)
+    return _fits(*out, up, stands(frame.image, circles, out[3][:, APEX:], up))
 
 
 def _fits(
-    circles: Floats, caps: Floats, covariances: Floats, told: Floats, counts: Floats, up: Floats
-) -> Fits:
+    circles: Floats, caps: Floats, covariances: Floats, told: Floats, counts: Floats,
+    up: Floats, stand: Floats,
+) -> Fits:  # fmt: skip
     return Fits(
         valid=counts[:, POINTS] > 0,
         circle=circles,
@@ -283,4 +288,5 @@ def _fits(
         lines=counts[:, LINES].astype(np.int64),
         misfit=counts[:, MISFIT],
         lean=np.arccos(np.clip(caps[:, N : N + 3] @ up, -1, 1)),
+        stand=stand,
     )

@@ -30,7 +30,7 @@ from mushpipe.stages.cap_kin import FEWEST, kin_of, unlike
 from mushpipe.stages.cap_model import ASPECT, ASPECT_SIGMA
 from mushpipe.stages.cap_order import Order, by_depth
 from mushpipe.stages.cap_solve import Habit, Noise
-from mushpipe.stages.cap_verify import chances
+from mushpipe.stages.cap_verify import chances, lone_chances
 from mushpipe.stages.discs import discs_of
 from mushpipe.stages.phase_learned import seen_by
 from mushpipe.stages.surface_fit import fit_tops, sources, variance_along, without_tip
@@ -140,8 +140,9 @@ class CapFit(Stage):
         """
         if self.min_score is None:
             return circles.score
-        kin = kin_of(frame.color, circles)
         seen = None if learned is None else seen_by(learned, circles)
+        lone = None if fits is None else lone_chances(circles, fits, seen)
+        kin = kin_of(frame.color, circles, lone)
         chance = chances(circles, unlike(kin), fits, seen)
         return np.where(clods(frame.color, circles, kin), np.minimum(chance, CLOD_CHANCE), chance)
 

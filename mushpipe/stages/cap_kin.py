@@ -44,17 +44,32 @@ class Kin(NamedTuple):
     sure: Ints
 
 
-def kin_of(color: Bytes, circles: Circles) -> Kin:
+def kin_of(color: Bytes, circles: Circles, lone: Floats | None = None) -> Kin:
     """Return what circles look like.
 
     Args:
         color: (H, W, 3) RGB.
         circles: As detected, with the scores of `phase-hough`.
+        lone: As in `sure_of`.
     """
-    sure = np.flatnonzero(circles.score >= SURE)
-    if len(sure) < FEWEST:
-        return Kin(np.full((len(circles), 3), np.nan), sure[:0])
+    sure = sure_of(circles.score, lone)
+    if not len(sure):
+        return Kin(np.full((len(circles), 3), np.nan), sure)
     return Kin(tones_of(color, circles), sure)
+
+
+def sure_of(score: Floats, lone: Floats | None = None) -> Ints:
+    """Return the rows of what is surely a cap; none where fewer than `FEWEST` are.
+
+    Args:
+        score: (N,) of `phase-hough`.
+        lone: (N,) chance of each to be a cap by what is known of it alone, where there are fits.
+            Where it speaks for no more than half of the others, nothing is sure: a detector that
+            takes clods for caps takes many of them.
+    """
+    likely = score >= SURE
+    sure = np.flatnonzero(likely if lone is None else likely & (lone >= SURE))
+    return sure if len(sure) >= FEWEST and 2 * len(sure) > likely.sum() else sure[:0]
 
 
 def tones_of(color: Bytes, circles: Circles) -> Floats:

@@ -28,7 +28,8 @@ ALIKE, PLAIN = 1.0, 0.6  # and is less unlike the sure caps and has a higher sco
 KINDRED, SEEN = 0.35, 0.7  # or is like them, as caps of a kind are, and a network sees it plainly
 FLAT_CHANCE = 0.01
 LEAST_SEEN = 0.005  # logits have no end
-FIT = ("misfit", "tilt", "aspect", "moved", "resized", "lean")
+STANDS, HIGHEST = 2.0, 3.0  # radii that a cap stands above the ground, as most do, and at most
+FIT = ("misfit", "tilt", "aspect", "moved", "resized", "lean", "stand")
 NAMES = ("score", *FIT, "unlike", "learned")
 BESIDE = "_learned"  # ends the name of a model beside a network
 FEW = "fitted_few"  # where few circles are surely caps
@@ -50,8 +51,9 @@ def features(
     Logit of the score; log of the misfit over the median in view, since what fits how well depends
     on the sensor; log of the sigma of the tilt, rad; height over radius, up to `ROUND`; how far the
     fit moves the circle, in its radii; log of how much larger or smaller it makes it; how far the
-    axis leans off the upright, rad; how unlike the sure caps it is (`cap_kin`); logit of how far it
-    is a circle of the network.
+    axis leans off the upright, rad; how far the apex stands above the ground, in radii, up to
+    `HIGHEST`, and `STANDS` where no ground is seen; how unlike the sure caps it is (`cap_kin`);
+    logit of how far it is a circle of the network.
     """
     table = np.full((len(circles), len(NAMES)), np.nan)
     table[:, 0], table[:, -2] = _logit(circles.score, 1e-4), unlike
@@ -77,6 +79,7 @@ def _of_fits(circles: Circles, fits: Fits) -> Floats:
             np.linalg.norm(fits.circle[:, :2] - circles.center, axis=1) / circles.radius,
             np.abs(np.log(fits.circle[:, 2] / circles.radius)),
             fits.lean,
+            np.nan_to_num(np.clip(fits.stand / fits.radius, 0, HIGHEST), nan=STANDS),
         ]
     )
 
@@ -95,6 +98,19 @@ def flat(fits: Fits, score: Floats, unlike: Floats, learned: Floats | None = Non
     if learned is not None:
         plain |= (unlike < KINDRED) & (learned > SEEN)
     return np.asarray(low & ~(plain & (fits.edges >= EDGED)))
+
+
+def lone_chances(circles: Circles, fits: Fits, learned: Floats | None = None) -> Floats:
+    """Return the probability (N,) of each circle to be a cap by what is known of it alone.
+
+    Args:
+        circles: As detected, with the scores of `phase-hough`.
+        fits: Of these circles.
+        learned: (N,) as in `chances`.
+    """
+    unknown = np.full(len(circles), np.nan)
+    table = np.nan_to_num(features(circles, unknown, fits, learned))
+    return np.where(fits.valid, _said(FEW, table, learned is not None), circles.score)
 
 
 def chances(

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mushpipe import Circles, RgbdFrame
 from mushpipe.core.types import Header
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_kin import DARK, FEWEST, MOST, SURE, USUAL, kin_of, unlike
+from mushpipe.stages.cap_kin import DARK, FEWEST, MOST, SURE, USUAL, kin_of, sure_of, unlike
 
 HEIGHT, WIDTH, RADIUS = 240, 320, 9.0
 CAP, CLOD, SOIL = np.array([190.0, 180, 165]), np.array([60.0, 45, 35]), np.array([40.0, 30, 25])
@@ -139,3 +139,24 @@ def test_without_depth_a_clod_goes_caps_stay_and_no_score_rises() -> None:
     assert (found.score <= 0.93).all()
     kept = CapFit().process(frame, circles)[2]
     assert np.array_equal(kept.score, circles.score)
+
+
+def test_what_is_surely_a_cap_is_so_by_the_detector_and_by_itself() -> None:
+    score = np.array([0.95] * 20 + [0.5] * 10)
+    lone = np.full(30, 0.95)
+    assert sure_of(score).tolist() == list(range(20))
+    lone[:9] = 0.8
+    assert sure_of(score, lone).tolist() == list(range(9, 20))
+    lone[9] = 0.8  # half of them: it is not known what caps look like here
+    assert len(sure_of(score, lone)) == 0
+    assert len(sure_of(score[15:], lone[15:])) == 0  # too few
+
+
+def test_clods_of_which_a_detector_is_sure_tell_nothing_of_what_caps_look_like() -> None:
+    circles = circles_of(30)
+    tones = np.tile(CLOD, (30, 1))
+    tones[:10] = CAP
+    lone = np.array([0.97] * 10 + [0.1] * 20)
+    assert np.isnan(unlike(kin_of(bed(circles, tones), circles, lone))).all()
+    lone[:18] = 0.97
+    assert np.isfinite(unlike(kin_of(bed(circles, tones), circles, lone))).all()

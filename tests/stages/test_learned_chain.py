@@ -20,6 +20,7 @@ from training.net.scenes import cap_mask
 
 RADII = (8.0, 45.0)
 BARE = {"scene": "lab", "count": 1, "clutter": 12}
+RUBBLE = {"pins": 0, "stumps": 6, "rubble": 120, "relief_mm": 3.0}
 
 
 @pytest.mark.slow
@@ -124,6 +125,32 @@ def test_one_cap_among_clutter_is_found_with_depth_and_hardly_a_cup_is_fitted() 
         score.add(circles, truth, counted(truth, *RADII))
     assert score.right >= 10
     assert score.false <= 3  # 7 where one model decides about beds and tables
+
+
+@pytest.mark.parametrize(
+    ("count", "right", "false"),
+    [(0, 0, 10), (4, 12, 12)],  # 36 false and 17 where clods tell what caps look like, or few do
+)
+def test_hardly_a_clod_is_taken_for_a_cap_where_there_are_few(
+    count: int, right: int, false: int
+) -> None:
+    net = CapNet(radius_px=(8, None), min_score=0.05, beside_depth=0.8)
+    detect = PhaseHough(radius_px=(8, None), min_score=0.1, use_learned=True)
+    fit, score = CapFit(min_score=0.5), Score()
+    for seed, soil, color in (
+        (103, 4.0, "brown"),
+        (104, 0.5, "white"),
+        (105, 1.0, "brown"),
+        (106, 2.0, "white"),
+    ):
+        scene = RUBBLE | {"count": count, "soil": soil, "cap_color": color}
+        frame = simulated(seed, width=640, height=480, **scene)
+        mask, learned = net.process(frame)
+        circles = fit.process(frame, detect.process(frame, mask, learned), learned)[-1]
+        truth = frame.attached[TRUTH_TOPIC]
+        score.add(circles, truth, counted(truth, *RADII))
+    assert score.right >= right
+    assert score.false <= false
 
 
 @pytest.mark.parametrize("learned", [False, True])

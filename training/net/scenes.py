@@ -21,6 +21,7 @@ from training.scenes import Case, stored
 
 TRAINING_SEED, TABLES_SEED, VALIDATION_SEED, JUDGING_SEED = 200_000, 201_000, 300_000, 400_000
 VERIFIER_SEED, CHOOSING_SEED = 500_000, 510_000  # family a
+SPARSE_SEED, SPARSE_JUDGING_SEED = 600_000, 610_000
 TRAINING, VALIDATION = 640, 60
 
 
@@ -102,6 +103,28 @@ def settings(seed: int) -> dict[str, Any]:
     return drawn | {"sunk": some(0.4, 1), "lids": round(some(0.3, 10))}
 
 
+def sparse(seed: int) -> dict[str, Any]:
+    """Draw the settings of a bed with few caps or none, on which other things are more."""
+    drawn, rng = settings(seed), np.random.default_rng([seed, 9])
+    count = 0 if rng.random() < 0.5 else int(rng.integers(1, 7))
+    small, large = drawn["size_mm"]
+    color = drawn["cap_color"]
+    return drawn | {
+        "scene": "bed",
+        "count": count,
+        "pins": int(rng.integers(0, 30)) if count and rng.random() < 0.4 else 0,
+        "fallen": 0,
+        "rubble": int(rng.integers(0, 160)),
+        "stumps": int(rng.integers(0, 12)),
+        "fresh": float(rng.uniform(0, 0.6)) if rng.random() < 0.4 else 0.0,
+        "foreign": int(rng.integers(1, 5)) if rng.random() < 0.25 else 0,
+        "lids": 0,
+        "printed": False,
+        "cap_color": "brown" if color == "wood" else color,
+        "size_mm": (max(12, small), max(20, large)),
+    }
+
+
 def picture(seed: int, cache: Path) -> Picture:
     """Return a frame, from the cache folder where it was rendered before."""
     path = cache / f"{seed}.npz"
@@ -147,6 +170,13 @@ def varied_cases(cache: Path, first: int, family: Literal["a", "b"], count: int)
     for seed in range(first, first + count):
         drawn = settings(seed) | {"shape_family": family}
         yield stored(cache / f"varied-{family}-{seed}.pickle", "varied", drawn)
+
+
+def sparse_cases(cache: Path, first: int, family: Literal["a", "b"], count: int) -> Iterator[Case]:
+    """Yield frames of `sparse` beds with depth, of `count` seeds from `first` on."""
+    for seed in range(first, first + count):
+        drawn = sparse(seed) | {"shape_family": family}
+        yield stored(cache / f"sparse-{family}-{seed}.pickle", "sparse", drawn)
 
 
 def main() -> None:

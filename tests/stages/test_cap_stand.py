@@ -1,0 +1,76 @@
+"""How high a cap stands over the ground around it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mushpipe.stages.cap_blocks import Image
+from mushpipe.stages.cap_fit import CapFit
+from mushpipe.stages.cap_order import by_depth
+from mushpipe.stages.cap_stand import stands
+from mushpipe.stages.upright import pixel_rays
+from tests.stages.caps import CAMERA, cap, circles_of, draw, frame_from
+
+DOWN = np.array([0.0, 0, 1])
+
+
+def ground(normal: np.ndarray, away: float) -> np.ndarray:
+    """Depth (H, W) m of the plane of the points p with p n = -away."""
+    rays = pixel_rays(CAMERA).astype(np.float64)
+    return -away / (rays @ normal[:2] + normal[2])
+
+
+def image_of(depth: np.ndarray, circles: np.ndarray) -> Image:
+    single = depth.astype(np.float32)
+    return Image(single, pixel_rays(CAMERA), by_depth(single, circles)[1], CAMERA.focal)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    lean=st.tuples(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4)),
+    u=st.floats(20, 300),
+    v=st.floats(20, 220),
+    radius=st.floats(4, 40),
+    high=st.floats(0, 0.1),
+)
+def test_it_is_the_distance_of_the_apex_from_the_plane_of_the_ground(
+    lean: tuple[float, float], u: float, v: float, radius: float, high: float
+) -> None:
+    up = np.array([*lean, -1.0]) / np.linalg.norm([*lean, -1.0])
+    depth = ground(up, 0.4)
+    foot = CAMERA.deproject(np.array([u, v]), np.array(depth[round(v), round(u)]))
+    apex = foot + up * (high - 0.4 - foot @ up)
+    circle = np.array([[u, v, radius]])
+    assert stands(image_of(depth, circle), circle, apex[None], up) == pytest.approx(high, abs=1e-5)
+
+
+def test_neighbours_and_missing_depth_are_no_ground() -> None:
+    circles = np.array([[160.0, 120, 20], [190, 120, 15], [160, 160, 18]])
+    depth = ground(-DOWN, 0.4)
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    for x, y, radius in circles:
+        depth[np.hypot(u - x, v - y) <= radius] = 0.36
+    depth[:, 130:140] = 0
+    apexes = np.tile([0.0, 0, 0.36], (3, 1))
+    found = stands(image_of(depth, circles), circles, apexes, -DOWN)
+    assert found == pytest.approx(np.full(3, 0.04), abs=1e-6)
+
+
+def test_where_no_ground_is_seen_it_is_not_known() -> None:
+    circles = np.array([[160.0, 120, 20], [160, 120, 60], [-30, 120, 10]])
+    apexes = np.tile([0.0, 0, 0.36], (3, 1))
+    found = stands(image_of(ground(-DOWN, 0.4), circles), circles, apexes, -DOWN)
+    assert np.isnan(found).tolist() == [True, False, True]
+    nothing = image_of(np.zeros((CAMERA.height, CAMERA.width)), circles)
+    assert np.isnan(stands(nothing, circles, apexes, -DOWN)).all()
+
+
+def test_a_fit_tells_how_high_its_cap_stands() -> None:
+    caps = [cap(10, 0, (-0.06, 0, 0.4), 0.02, 0.5), cap(0, 0, (0.06, 0, 0.43), 0.02, 0.6)]
+    depth, gray = draw(caps, 0.44)
+    frame, circles = frame_from(depth, gray), circles_of(caps)
+    fits = CapFit(up="camera").fit(frame.gray, frame.depth_m, CAMERA, circles)
+    assert fits.stand == pytest.approx([0.44 - c.apex[2] for c in caps], abs=1e-3)
