@@ -262,8 +262,8 @@ def fit_caps(
         np.zeros((n, COUNTS)),
     )
     fit_all(frame, circles, rank, habit, settings, out)
-    up = np.array(habit.up)
-    return _fits(*out, up, stands(frame.image, circles, out[3][:, APEX:], up))
+    up, apexes = np.array(habit.up), np.ascontiguousarray(out[3][:, APEX:])  # as the kernel wants
+    return _fits(*out, up, stands(frame.image, circles, apexes, up))
 
 
 def _fits(
