@@ -179,7 +179,7 @@ def main() -> None:
     few = list(found(chain(few_cases(cache), sparse), stumps=True))
     alone = samples([*few, *(frame for frame in usual if not len(sure_of(frame.circles.score)))])
     lone = {model: taught(model, alone, ridge) for model in OF_FEW}
-    kin = samples([*usual, *few], lone)
+    kin = samples(usual, lone)
     others = {model: taught(model, kin, ridge) for model in MODELS if model not in OF_FEW}
     write({model: (lone | others)[model] for model in MODELS}, arguments.out, HEAD)
 

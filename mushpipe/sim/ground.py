@@ -14,6 +14,7 @@ from mushpipe.sim.noise import Reals, blurred, mix, smoothstep
 from mushpipe.sim.planting import Area
 
 RIM_HEIGHT = 0.035
+PEBBLE_APART = 10.0  # in texture coordinates, by which each has a colour of its own
 
 
 @dataclass(frozen=True)
@@ -159,16 +160,18 @@ def _mycelium(
     return np.asarray(np.clip(np.maximum(cover, threads), 0, 0.95), np.float32)
 
 
-def _lumps(rng: np.random.Generator, rings: int, material: Material) -> list[Mesh]:
-    """Return some different knobbly balls of radius about 1 around the origin."""
+def _lumps(
+    rng: np.random.Generator, rings: int, material: Material, knobs: float = 0.16
+) -> list[Mesh]:
+    """Return some different balls of radius about 1 around the origin, with such `knobs`."""
     t = np.linspace(0, np.pi, rings)
     ball = revolve(np.sin(t), np.cos(t), 2 * rings)
     ball[[0, -1], :, :2] = 0
     kinds = []
     for _ in range(12):
         turns, phase = rng.normal(0, 2.2, (3, 3)), rng.uniform(0, 2 * np.pi, 3)
-        knobs = 1 + 0.16 * np.cos(ball @ turns + phase).sum(axis=-1, keepdims=True)
-        kinds.append(sheet(ball * knobs * rng.uniform(0.7, 1.15, 3), material))
+        bent = 1 + knobs * np.cos(ball @ turns + phase).sum(axis=-1, keepdims=True)
+        kinds.append(sheet(ball * bent * rng.uniform(0.7, 1.15, 3), material))
     return kinds
 
 
@@ -217,6 +220,21 @@ def rubble(
         z = ground.height_at(flat) + radius * rng.uniform(-0.3, 0.5, len(flat))
         pieces += _scatter(_lumps(rng, 15, material), np.column_stack([flat, z]), radius, rng)
     return pieces
+
+
+def pebbles(
+    ground: Ground, area: Area, count: int, pixel: float, rng: np.random.Generator
+) -> list[Mesh]:
+    """Scatter smooth stones of 4 to 22 pixels (m each), sunk in by a fifth to four."""
+    flat = area.draw(rng, count)
+    radius = pixel * np.exp(rng.uniform(np.log(4), np.log(22), count))
+    z = ground.height_at(flat) + radius * rng.uniform(-0.6, 0.6, count)
+    kinds = _lumps(rng, 15, Material.PEBBLE, knobs=0.015)
+    pieces = _scatter(kinds, np.column_stack([flat, z]), radius, rng)
+    return [
+        replace(piece, texture=piece.texture + PEBBLE_APART * number)
+        for number, piece in enumerate(pieces)
+    ]
 
 
 def primordia(

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mushpipe.core.arrays import Floats, Ints, Singles
+from mushpipe.sim.ground import PEBBLE_APART
 from mushpipe.sim.mesh import Material
 from mushpipe.sim.mushroom import Kind
 from mushpipe.sim.noise import Noise3, mix, smoothstep
@@ -27,7 +28,7 @@ _PLAIN: dict[Material, tuple[float, float, float]] = {
 }
 _GLOSS = np.zeros(len(Material), np.float32)
 _GLOSS[[Material.SOIL, Material.CLOD, Material.STONE]] = 0.04, 0.04, 0.12
-_GLOSS[[Material.TABLE, Material.PLASTIC]] = 0.10, 0.45
+_GLOSS[[Material.TABLE, Material.PLASTIC, Material.PEBBLE]] = 0.10, 0.45, 0.06
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +74,7 @@ class Painter:
             Material.CUT: self._cut,
             Material.CLOD: self._clod,
             Material.STONE: self._stone,
+            Material.PEBBLE: self._pebble,
             Material.PAPER: self._paper,
             Material.PLASTIC: self._plastic,
         }
@@ -204,6 +206,16 @@ class Painter:
         shade = 0.10 + 0.05 * self._at(surface, rows, 0.03)
         tone = 1 + 0.15 * self._at(surface, rows, 0.0012)
         return np.asarray((shade * tone)[:, None] * np.array([1.0, 0.95, 0.87]), np.float32)
+
+    def _pebble(self, surface: Surface, rows: Ints) -> Singles:
+        """White, gray or brown, each of one colour with specks."""
+        q = surface.texture[rows]
+        own = np.round(q / PEBBLE_APART)
+        shade = np.clip(0.28 * np.exp(0.8 * self._noise(own * 0.37, 0.1)), 0.04, 0.75)
+        warm = smoothstep(-0.3, 1.2, self._noise(own * 0.61, 0.1))[:, None]
+        tone = 1 + 0.05 * self._noise(q, 0.03) + 0.05 * self._noise(q, 0.2)
+        color = np.array([1.0, 0.98, 0.95]) - warm * np.array([0.0, 0.18, 0.40])
+        return np.asarray((shade * tone)[:, None] * color, np.float32)
 
     def _paper(self, surface: Surface, rows: Ints) -> Singles:
         """White paper with lines of print."""

@@ -31,6 +31,7 @@ class Material(IntEnum):
     METAL = 13
     FLOOR = 14
     TARGET = 15
+    PEBBLE = 16
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ Reals = NDArray[np.floating[Any]]
 _PARTS = (
     "plant", "ground", "texture", "ambient", "light", "photo", "photo frame", "fixed pattern",
     "depth frame", "holes", "lean", "relief", "rubble", "foreign", "sunk", "lids", "old", "fresh",
+    "pebbles",
 )  # fmt: skip
 
 

@@ -65,6 +65,9 @@ class SceneSettings(Group):
     rubble: int = Field(
         0, ge=0, le=300, description="clods and stones as large as caps, in view, about"
     )
+    pebbles: int = Field(
+        0, ge=0, le=300, description="smooth stones of any colour, as large as caps, in view, about"
+    )
     foreign: int = Field(0, ge=0, le=20, description="papers, boxes, cups and rails on the bed")
     lids: int = Field(0, ge=0, le=60, description="round lids and paper discs that lie flat")
     tray: bool = Field(False, description="show the rim of the tray at the left")

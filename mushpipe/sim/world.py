@@ -152,6 +152,8 @@ def _things(
         count, pixel = round(settings.rubble * share), settings.pixel()
         stones = generator(settings.seed, "rubble")
         things += grounds.rubble(base, view.grown(0.02), count, pixel, stones)
+        count, smooth = round(settings.pebbles * share), generator(settings.seed, "pebbles")
+        things += grounds.pebbles(base, view.grown(0.02), count, pixel, smooth)
         strange = generator(settings.seed, "foreign")
         things += tables.foreign(settings.foreign, view, feet, base.height_at, strange)
         if settings.tray:

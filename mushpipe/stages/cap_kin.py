@@ -17,7 +17,8 @@ from mushpipe.core.arrays import Bytes, Floats, Ints, locked
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.discs import discs_of
 
-SURE = 0.9  # score of what is surely a cap
+SURE = 0.9  # score of what is surely a cap,
+ALONE = 0.7  # where it is one by itself with such a chance
 FEWEST = 6  # of them: fewer do not tell what is usual
 WITHIN = 0.6  # of the radius: what lies there is no rim and no neighbour
 _STEPS = np.linspace(-1, 1, 15)
@@ -68,7 +69,7 @@ def sure_of(score: Floats, lone: Floats | None = None) -> Ints:
             takes clods for caps takes many of them.
     """
     likely = score >= SURE
-    sure = np.flatnonzero(likely if lone is None else likely & (lone >= SURE))
+    sure = np.flatnonzero(likely if lone is None else likely & (lone >= ALONE))
     return sure if len(sure) >= FEWEST and 2 * len(sure) > likely.sum() else sure[:0]
 
 

@@ -145,9 +145,9 @@ def test_what_is_surely_a_cap_is_so_by_the_detector_and_by_itself() -> None:
     score = np.array([0.95] * 20 + [0.5] * 10)
     lone = np.full(30, 0.95)
     assert sure_of(score).tolist() == list(range(20))
-    lone[:9] = 0.8
+    lone[:9] = 0.6
     assert sure_of(score, lone).tolist() == list(range(9, 20))
-    lone[9] = 0.8  # half of them: it is not known what caps look like here
+    lone[9] = 0.6  # half of them: it is not known what caps look like here
     assert len(sure_of(score, lone)) == 0
     assert len(sure_of(score[15:], lone[15:])) == 0  # too few
 

@@ -122,6 +122,7 @@ def sparse(seed: int) -> dict[str, Any]:
         "printed": False,
         "cap_color": "brown" if color == "wood" else color,
         "size_mm": (max(12, small), max(20, large)),
+        "pebbles": int(rng.integers(0, 80)) if rng.random() < 0.4 else 0,
     }
 
 
