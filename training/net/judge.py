@@ -1,8 +1,9 @@
 """Judge `cap-net` beside the classic detector, on what trained neither.
 
 `python -m training.net.judge` prints simulated scenes of both shape families by condition, with
-`--choosing` those for choices of design, with `--recordings FILE...` recordings that carry their
-truth, and with `--field FOLDER` labelled real ones.
+`--choosing` those for choices of design, with `--sparse N` beds with few caps or none, with
+`--recordings FILE...` recordings that carry their truth, and with `--field FOLDER` labelled real
+ones.
 """
 
 from __future__ import annotations
@@ -20,7 +21,13 @@ from mushpipe.stages.phase_hough import PhaseHough
 from training import judge
 from training.field import RANGES, labelled_frames, result
 from training.matching import Score, counted
-from training.net.scenes import CHOOSING_SEED, JUDGING_SEED, varied_cases
+from training.net.scenes import (
+    CHOOSING_SEED,
+    JUDGING_SEED,
+    SPARSE_JUDGING_SEED,
+    sparse_cases,
+    varied_cases,
+)
 from training.scenes import Case, choosing_cases, judging_cases, recorded_cases
 from training.verifier import RADII, segmentations
 
@@ -102,6 +109,7 @@ def main() -> None:
     parser.add_argument("--choosing", action="store_true", help="the frames for choices of design")
     parser.add_argument("--each", type=int, default=EACH, help="frames of a row per shape family")
     parser.add_argument("--varied", type=int, default=VARIED, help="how many varied frames")
+    parser.add_argument("--sparse", type=int, help="so many beds with few caps or none, instead")
     parser.add_argument("--field", type=Path, help="labelled real recordings instead")
     parser.add_argument("--recordings", type=Path, nargs="+", help="with truth, instead")
     arguments = parser.parse_args()
@@ -110,6 +118,8 @@ def main() -> None:
             print(line)
     else:
         cases = scenes(arguments.cache, arguments.choosing, arguments.each, arguments.varied)
+        if arguments.sparse:
+            cases = sparse_cases(arguments.cache, SPARSE_JUDGING_SEED, "b", arguments.sparse)
         if arguments.recordings:
             cases = chain.from_iterable(map(recorded_cases, arguments.recordings))
         print(simulated(arguments.models, cases, arguments.peers))
