@@ -2,8 +2,8 @@
 
 Circles of `phase-hough`, alone and beside `cap-net`, down to a low score, are fitted, in depth as
 it was simulated and in worse, and labelled by the simulator's truth; so are those of the image
-alone, without a fit. Where few caps are in view, stumps, stones and cups are as many: a model of
-its own learns from such frames.
+alone, without a fit. Where few caps are in view, stumps, stones and cups are as many: models of
+their own learn from such frames.
 """
 
 from __future__ import annotations
@@ -24,10 +24,22 @@ from mushpipe.evaluate.matching import circle_iou
 from mushpipe.stages.cap_batch import Fits
 from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.cap_kin import Kin, sure_of, tones_of, unlike
-from mushpipe.stages.cap_verify import BESIDE, FEW, FILE, FIT, MODELS, NAMES, features, flat
+from mushpipe.stages.cap_verify import (
+    BESIDE,
+    FEW,
+    FILE,
+    FIT,
+    LONE,
+    MODELS,
+    NAMES,
+    RUBBLE,
+    features,
+    flat,
+    lone_chances,
+)
 from mushpipe.stages.phase_hough import PhaseHough
 from mushpipe.stages.phase_learned import seen_by
-from mushpipe.stages.verifier import LIMIT, logistic, logit, weights_of
+from mushpipe.stages.verifier import LIMIT, weights_of
 from training.harder import harder
 from training.logistic import fit, write
 from training.matching import counted, matched
@@ -40,14 +52,12 @@ NEUTRAL = 0.3  # IoU with a mushroom that need not be found, from which on a cir
 SETTINGS = [
     {"use_learned": net, "use_depth": deep} for deep in (True, False) for net in (False, True)
 ]
-OF_FEW = (FEW, FEW + BESIDE)
-SQUARED = ("misfit", "tilt", "aspect", "lean", "stand")  # for these
-# What they are asked about are caps by so much; in their training they are by less, which would
-# lose caps that a stereo camera shows badly.
-SHARE = 0.6
+SQUARED = ("misfit", "tilt", "aspect", "lean", "stand")  # by models of lone circles
+# So much of what a lone circle's models are asked is a cap; in their training it is less, which
+# would lose caps that a stereo camera shows badly. Both of them must take it for one.
+SHARE = {FEW: 0.9, RUBBLE: 0.6}
 SPARSE = 160  # frames
 KNOWN = (FIT[0], "unlike", "learned")  # in some samples, and not in others
-Models = Mapping[str, dict[str, Any]]
 STAGES = [PhaseHough(radius_px=RADII, min_score=LEAST, **each) for each in SETTINGS]
 HEAD = """\
 # The verifier of the stage `cap-fit`: logistic regressions over what the fit found, over how like
@@ -114,19 +124,21 @@ def found(cases: Iterable[Case], stumps: bool = False) -> Iterator[Found]:
                 )
 
 
-def samples(frames: Iterable[Found], lone: Models | None = None) -> tuple[Floats, Floats]:
+def samples(
+    frames: Iterable[Found], lone: Mapping[str, Floats] | None = None
+) -> tuple[Floats, Floats]:
     """Return features (N, F) and labels (N,) of all circles that a model decides about.
 
     Args:
         frames: What was found.
-        lone: Models of lone circles, which say with the detector what is surely a cap; without
-            them every circle is a lone one.
+        lone: Weights of the models of lone circles, which say with the detector what is surely a
+            cap; without them every circle is a lone one.
     """
     rows, right = [], []
     for circles, tones, fits, seen, label in frames:
         other = np.full(len(circles), np.nan)
         if lone is not None:
-            chance = None if fits is None else lone_of(circles, fits, seen, lone)
+            chance = None if fits is None else lone_chances(circles, fits, seen, lone)
             other = unlike(Kin(tones, sure_of(circles.score, chance)))
         use = np.isfinite(label)
         if fits is not None:
@@ -134,13 +146,6 @@ def samples(frames: Iterable[Found], lone: Models | None = None) -> tuple[Floats
         rows.append(features(circles, other, fits, seen)[use])
         right.append(label[use])
     return np.concatenate(rows), np.concatenate(right)
-
-
-def lone_of(circles: Circles, fits: Fits, seen: Floats | None, lone: Models) -> Floats:
-    """Return what `lone_chances` does, of models that are not in the package yet."""
-    table = np.nan_to_num(features(circles, np.full(len(circles), np.nan), fits, seen))
-    weights = weights_of(lone[FEW if seen is None else FEW + BESIDE], NAMES)
-    return np.where(fits.valid, logistic(logit(table, weights)), circles.score)
 
 
 def teaches(rows: Floats, model: str) -> Bools:
@@ -152,17 +157,16 @@ def teaches(rows: Floats, model: str) -> Bools:
     names = MODELS[model]
     fitted, alike, beside = np.isfinite(rows[:, [NAMES.index(name) for name in KNOWN]]).T
     use = (fitted == (FIT[0] in names)) & (beside == ("learned" in names))
-    return np.asarray(use & (alike == (model not in OF_FEW)))
+    return np.asarray(use & (alike == (model.removesuffix(BESIDE) not in LONE)))
 
 
 def taught(model: str, samples: tuple[Floats, Floats], ridge: float) -> dict[str, Any]:
     """Return a model that has learnt from those samples of which it is asked."""
-    names, few = MODELS[model], model in OF_FEW
+    names, share = MODELS[model], SHARE.get(model.removesuffix(BESIDE))
     rows, right = (part[teaches(samples[0], model)] for part in samples)
     print(f"{model}: {len(rows)} circles, {right.mean():.2f} right")
     table = rows[:, [NAMES.index(name) for name in names]]
-    squared, share = (SQUARED, SHARE) if few else ((), None)
-    return fit(table, right, names, ridge, LIMIT, squared, share)
+    return fit(table, right, names, ridge, LIMIT, SQUARED if share else (), share)
 
 
 def main() -> None:
@@ -174,14 +178,20 @@ def main() -> None:
     arguments = parser.parse_args()
     cache, ridge = arguments.cache, arguments.ridge
     varied = varied_cases(cache, VERIFIER_SEED, "a", VARIED)
-    sparse = sparse_cases(cache, SPARSE_SEED, "a", SPARSE)
     usual = list(found(chain(training_cases(cache), more_cases(cache), varied)))
-    few = list(found(chain(few_cases(cache), sparse), stumps=True))
-    alone = samples([*few, *(frame for frame in usual if not len(sure_of(frame.circles.score)))])
-    lone = {model: taught(model, alone, ridge) for model in OF_FEW}
-    kin = samples(usual, lone)
-    others = {model: taught(model, kin, ridge) for model in MODELS if model not in OF_FEW}
-    write({model: (lone | others)[model] for model in MODELS}, arguments.out, HEAD)
+    lone = [frame for frame in usual if not len(sure_of(frame.circles.score))]
+    lone += found(few_cases(cache), stumps=True)
+    sparse = found(sparse_cases(cache, SPARSE_SEED, "a", SPARSE), stumps=True)
+    learnt = {FEW: samples(lone), RUBBLE: samples([*lone, *sparse])}
+    models = {
+        name: taught(name, rows, ridge)
+        for model, rows in learnt.items()
+        for name in (model, model + BESIDE)
+    }
+    weights = {name: weights_of(model, NAMES) for name, model in models.items()}
+    known = samples(usual, weights)
+    models |= {name: taught(name, known, ridge) for name in MODELS if name not in models}
+    write({name: models[name] for name in MODELS}, arguments.out, HEAD)
 
 
 if __name__ == "__main__":

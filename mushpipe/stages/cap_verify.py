@@ -8,6 +8,7 @@ in `fitted.yaml`; `training/fitted.py` makes them.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
@@ -28,16 +29,19 @@ ALIKE, PLAIN = 1.0, 0.6  # and is less unlike the sure caps and has a higher sco
 KINDRED, SEEN = 0.35, 0.7  # or is like them, as caps of a kind are, and a network sees it plainly
 FLAT_CHANCE = 0.01
 LEAST_SEEN = 0.005  # logits have no end
-STANDS, HIGHEST = 2.0, 3.0  # radii that a cap stands above the ground, as most do, and at most
-FIT = ("misfit", "tilt", "aspect", "moved", "resized", "lean", "stand")
+STANDS = 2.0  # radii that most caps stand above the ground: what stands higher is no likelier one
+FORM = ("misfit", "tilt", "aspect", "moved", "resized", "lean")
+FIT = (*FORM, "stand")
 NAMES = ("score", *FIT, "unlike", "learned")
 BESIDE = "_learned"  # ends the name of a model beside a network
-FEW = "fitted_few"  # where few circles are surely caps
+# Where few circles are surely caps: beside the cups and boxes of a table, and the clods of a bed.
+LONE = FEW, RUBBLE = "fitted_few", "fitted_rubble"
 # What is known decides which model is asked; each is over some of these features.
 ALONE = {
     "fitted": ("score", *FIT),
     "fitted_kin": ("score", *FIT, "unlike"),
-    FEW: ("score", *FIT),
+    FEW: ("score", *FORM),
+    RUBBLE: ("score", *FIT),
     "seen_kin": ("score", "unlike"),
 }
 MODELS = ALONE | {name + BESIDE: (*names, "learned") for name, names in ALONE.items()}
@@ -52,8 +56,8 @@ def features(
     on the sensor; log of the sigma of the tilt, rad; height over radius, up to `ROUND`; how far the
     fit moves the circle, in its radii; log of how much larger or smaller it makes it; how far the
     axis leans off the upright, rad; how far the apex stands above the ground, in radii, up to
-    `HIGHEST`, and `STANDS` where no ground is seen; how unlike the sure caps it is (`cap_kin`);
-    logit of how far it is a circle of the network.
+    `STANDS`, and that where no ground is seen; how unlike the sure caps it is (`cap_kin`); logit of
+    how far it is a circle of the network.
     """
     table = np.full((len(circles), len(NAMES)), np.nan)
     table[:, 0], table[:, -2] = _logit(circles.score, 1e-4), unlike
@@ -79,7 +83,7 @@ def _of_fits(circles: Circles, fits: Fits) -> Floats:
             np.linalg.norm(fits.circle[:, :2] - circles.center, axis=1) / circles.radius,
             np.abs(np.log(fits.circle[:, 2] / circles.radius)),
             fits.lean,
-            np.nan_to_num(np.clip(fits.stand / fits.radius, 0, HIGHEST), nan=STANDS),
+            np.nan_to_num(np.clip(fits.stand / fits.radius, 0, STANDS), nan=STANDS),
         ]
     )
 
@@ -100,17 +104,34 @@ def flat(fits: Fits, score: Floats, unlike: Floats, learned: Floats | None = Non
     return np.asarray(low & ~(plain & (fits.edges >= EDGED)))
 
 
-def lone_chances(circles: Circles, fits: Fits, learned: Floats | None = None) -> Floats:
+def lone_chances(
+    circles: Circles,
+    fits: Fits,
+    learned: Floats | None = None,
+    models: Mapping[str, Floats] | None = None,
+) -> Floats:
     """Return the probability (N,) of each circle to be a cap by what is known of it alone.
+
+    It must be one beside cups and boxes, and among clods.
 
     Args:
         circles: As detected, with the scores of `phase-hough`.
         fits: Of these circles.
         learned: (N,) as in `chances`.
+        models: Weights, by name, in place of those of the package.
     """
-    unknown = np.full(len(circles), np.nan)
-    table = np.nan_to_num(features(circles, unknown, fits, learned))
-    return np.where(fits.valid, _said(FEW, table, learned is not None), circles.score)
+    table = features(circles, np.full(len(circles), np.nan), fits, learned)
+    return np.where(fits.valid, _lone(table, learned is not None, models), circles.score)
+
+
+def _lone(table: Floats, beside: bool, models: Mapping[str, Floats] | None = None) -> Floats:
+    """Return what the models of lone circles say (N,) of features (N, F): the least of it.
+
+    Of what a network is blind to there, as many are cups and stumps: it has its full say.
+    """
+    weights, known = models or _models(), np.nan_to_num(table)
+    said = [logit(known, weights[name + BESIDE * beside]) for name in LONE]
+    return logistic(np.minimum(*said))
 
 
 def chances(
@@ -120,8 +141,8 @@ def chances(
 
     It is what the fit tells, or the score where nothing was fitted; less where the circle looks
     unlike the sure caps. That it looks like them is no reason to believe in it: stems do, too.
-    Where few are sure, other things than caps are more of what is seen, and a model of its own
-    decides. What was fitted as flat, and is not plainly a cap, has `FLAT_CHANCE` at most.
+    Where few are sure, other things than caps are more of what is seen, and models of their own
+    decide. What was fitted as flat, and is not plainly a cap, has `FLAT_CHANCE` at most.
 
     Args:
         circles: As detected, with the scores of `phase-hough`.
@@ -133,10 +154,11 @@ def chances(
             it was trained on.
     """
     table = np.nan_to_num(features(circles, unlike, fits, learned))
-    model = {name: _said(name, table, learned is not None) for name in ALONE}
+    model = {name: _said(name, table, learned is not None) for name in ALONE if name not in LONE}
     chance, alike = circles.score, model["seen_kin"]
     if fits is not None:
-        fitted = np.where(np.isfinite(unlike), model["fitted"], model[FEW])
+        lone = _lone(table, learned is not None)
+        fitted = np.where(np.isfinite(unlike), model["fitted"], lone)
         chance = np.where(fits.valid, fitted, chance)
         low = flat(fits, circles.score, unlike, learned)
         chance = np.where(low, np.minimum(chance, FLAT_CHANCE), chance)
@@ -150,8 +172,6 @@ def _said(name: str, table: Floats, beside: bool) -> Floats:
     if not beside:
         return logistic(alone)
     with_it = logit(table, _models()[name + BESIDE])
-    if name == FEW:  # of what it is blind to, as many are cups and stumps
-        return logistic(with_it)
     return logistic(np.maximum(with_it, (alone + with_it) / 2))
 
 

@@ -37,7 +37,7 @@ def test_a_doubtful_network_finds_fewer_circles_with_lower_scores_and_no_others(
 def test_a_circle_teaches_the_models_that_would_be_asked_about_it() -> None:
     known = {  # fit, likeness -> models
         (True, True): ["fitted", "fitted_kin"],
-        (True, False): ["fitted_few"],
+        (True, False): ["fitted_few", "fitted_rubble"],
         (False, True): ["seen_kin"],
         (False, False): [],
     }
