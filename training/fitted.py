@@ -52,7 +52,7 @@ NEUTRAL = 0.3  # IoU with a mushroom that need not be found, from which on a cir
 SETTINGS = [
     {"use_learned": net, "use_depth": deep} for deep in (True, False) for net in (False, True)
 ]
-SQUARED = ("misfit", "tilt", "aspect", "lean", "stand")  # by models of lone circles
+SQUARED = ("misfit", "tilt", "aspect", "lean")  # by models of lone circles
 # So much of what a lone circle's models are asked is a cap; in their training it is less, which
 # would lose caps that a stereo camera shows badly. Both of them must take it for one.
 SHARE = {FEW: 0.9, RUBBLE: 0.6}
