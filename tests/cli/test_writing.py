@@ -290,7 +290,8 @@ def test_no_folder_is_made_where_a_run_cannot_begin(folder: Path, options: tuple
     path = ("--set", "log.path=deep/er/out.mcap")
     done = mushpipe("run", "graph.yaml", *path, *options, cwd=folder)
     assert done.returncode != 0
-    assert {*folder.iterdir()} == before, done.stderr
+    made = {*folder.iterdir()} - before
+    assert made <= {folder / "__pycache__"}, done.stderr  # of the plugin, as Python keeps it
 
 
 @pytest.mark.parametrize(
