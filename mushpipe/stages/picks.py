@@ -16,7 +16,7 @@ from mushpipe import Circles, DepthSource, Locations, PickFlag, Picks, Poses, Rg
 from mushpipe.core.arrays import Floats, Ints, Rows
 from mushpipe.core.errors import UsageError
 from mushpipe.core.transform import Transform, TransformSetting
-from mushpipe.stages.plausible import contradictory, require_plausible
+from mushpipe.stages.plausible import contradictory
 from mushpipe.stages.rows import require_same_rows
 from mushpipe.stages.surroundings import clearance, hidden_share
 from mushpipe.stages.tracks import Tracks
@@ -126,7 +126,6 @@ class MakePicks(Stage):
         n = len(circles)
         poses = Poses.unknown(n) if poses is None else poses
         require_same_rows(circles, locations, poses, frame.camera)
-        require_plausible(circles, locations, poses, frame.camera)
         wrong = contradictory(circles, locations, poses, frame.camera)
         locations, poses = locations.without(wrong), poses.without(wrong)
         poses = self._outward(poses, locations, frame.header.sequence)

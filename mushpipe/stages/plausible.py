@@ -15,18 +15,6 @@ MOST = 4.0  # times that the lengths of one row may differ: one of them is of so
 LARGEST_M = 1.0  # no mushroom is larger, in metres
 
 
-def require_plausible(
-    circles: Circles, locations: Locations, poses: Poses, camera: Camera | None
-) -> None:
-    """Raise ValueError where something lies behind the camera, or a length is of another unit."""
-    _require_in_front(locations.position, "location")
-    _require_in_front(poses.apex, "pose")
-    _require_distance(locations)
-    if camera is not None:
-        _require_size(circles, locations, poses, camera)
-    _require_mushrooms(locations)
-
-
 def contradictory(
     circles: Circles, locations: Locations, poses: Poses, camera: Camera | None
 ) -> Bools:
@@ -34,18 +22,25 @@ def contradictory(
 
     Depth of a flying pixel at the centre puts a cap metres away, where its circle is as wide as a
     table and its diameter is not. A length of another unit is alone where one mushroom is in view.
+
+    Raises:
+        ValueError: Something lies behind the camera, a distance is not that of its position, or
+            most lengths are of another unit.
     """
-    wrong = np.asarray(locations.diameter > LARGEST_M)
-    if camera is None:
-        return wrong
+    _require_in_front(locations.position, "location")
+    _require_in_front(poses.apex, "pose")
+    _require_distance(locations)
+    diameter, way = locations.diameter, lengths(poses.apex - locations.position)
     across = _across(circles, locations, camera)
-    far = lengths(poses.apex - locations.position) > MOST * across
-    return wrong | far | _differ(locations.diameter, across, MOST)
+    _require_unit(diameter, way, across)
+    wrong = (diameter > LARGEST_M) | (way > MOST * across) | _differ(diameter, across, MOST)
+    return np.asarray(wrong)
 
 
-def _across(circles: Circles, locations: Locations, camera: Camera) -> Floats:
-    """Return how wide circles (N,) are where their locations are, m."""
-    return np.asarray(2 * circles.radius * locations.position[:, 2] / camera.focal)
+def _across(circles: Circles, locations: Locations, camera: Camera | None) -> Floats:
+    """Return how wide circles (N,) are where their locations are, m; NaN without calibration."""
+    focal = np.nan if camera is None else camera.focal
+    return np.asarray(2 * circles.radius * locations.position[:, 2] / focal)
 
 
 def _require_in_front(points: Floats, what: str) -> None:
@@ -68,33 +63,26 @@ def _require_distance(locations: Locations) -> None:
         )
 
 
-def _require_size(circles: Circles, locations: Locations, poses: Poses, camera: Camera) -> None:
-    """Raise ValueError where most diameters, or ways to apexes, are far from the circles' sizes.
+def _require_unit(diameter: Floats, way: Floats, across: Floats) -> None:
+    """Raise ValueError where most diameters, or ways to apexes, are of another unit.
 
     A unit is wrong in all rows. In one it is a depth that is wrong: the paper's method takes
     position and diameter from different pixels (`contradictory`).
     """
-    across = _across(circles, locations, camera)
-    differs = _differ(locations.diameter, across)
-    if (row := _usual(differs, locations.diameter)) is not None:
+    if (row := _usual(_differ(diameter, across), diameter)) is not None:
         raise ValueError(
-            f"row {row}: its diameter is {locations.diameter[row]:.3g} m, but its circle is "
+            f"row {row}: its diameter is {diameter[row]:.3g} m, but its circle is "
             f"{across[row]:.3g} m wide at its location, and so it is in most rows: {_METRES}"
         )
-    way = lengths(poses.apex - locations.position)
     if (row := _usual(way > UNIT * across, way)) is not None:
         raise ValueError(
             f"row {row}: the apex of its pose is {way[row]:.3g} m from its location, but its "
             f"circle is {across[row]:.3g} m wide there, and so it is in most rows: {_METRES}"
         )
-
-
-def _require_mushrooms(locations: Locations) -> None:
-    """Raise ValueError where most diameters are those of no mushroom."""
-    if (row := _usual(locations.diameter > LARGEST_M, locations.diameter)) is not None:
+    if (row := _usual(diameter > LARGEST_M, diameter)) is not None:
         raise ValueError(
-            f"row {row}: its diameter is {locations.diameter[row]:.3g} m, and more than "
-            f"{LARGEST_M:g} m in most rows: are all lengths in metres?"
+            f"row {row}: its diameter is {diameter[row]:.3g} m, and more than {LARGEST_M:g} m in "
+            "most rows: are all lengths in metres?"
         )
 
 
