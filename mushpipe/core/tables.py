@@ -18,6 +18,7 @@ from mushpipe.core.arrays import Bools, Bytes, Floats, Ints, locked
 from mushpipe.core.geometry import axis_from_quaternion
 
 AXIS_TOLERANCE = 1e-3
+LARGEST_M = 1.0  # no mushroom is larger
 _EXACTLY = "must be finite exactly where its source is not MISSING"
 
 

@@ -17,7 +17,7 @@ from pydantic import Field, field_validator, model_validator
 from mushpipe.core.arrays import Bools, Floats, Rows
 from mushpipe.core.geometry import axis_from_quaternion
 from mushpipe.core.group import Group
-from mushpipe.core.tables import AXIS_TOLERANCE, DepthSource, PickFlag, Picks
+from mushpipe.core.tables import AXIS_TOLERANCE, LARGEST_M, DepthSource, PickFlag, Picks
 from mushpipe.core.transform import REACH
 
 Reason = Literal["no_depth", "estimated", "invalid", "workspace", "claimed", "limit"]
@@ -29,7 +29,7 @@ _FLAGS = tuple((int(flag), flag.name.lower()) for flag in PickFlag if flag.name)
 _SOURCES = {int(source): source.name.lower() for source in DepthSource}
 UNIT_TOLERANCE = 1e-3
 # Beyond these a number is not a measurement.
-FARTHEST_M, SMALLEST_M, LARGEST_M = 100.0, 0.0001, 1.0
+FARTHEST_M, SMALLEST_M = 100.0, 0.0001
 ID_LIMIT = 10**15  # an acknowledgement has no place for more digits
 
 

@@ -7,12 +7,12 @@ import numpy as np
 from mushpipe import Circles, Locations, Poses
 from mushpipe.core.arrays import Bools, Floats
 from mushpipe.core.geometry import Camera, lengths
+from mushpipe.core.tables import LARGEST_M
 
 _METRES = "are all lengths in metres, and all of this circle?"
 # No unit is mistaken for another by less. What is found differs by a factor of three at most.
 UNIT = 10.0
 MOST = 4.0  # times that the lengths of one row may differ: one of them is of something else
-LARGEST_M = 1.0  # no mushroom is larger, in metres
 
 
 def contradictory(
