@@ -2,39 +2,44 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Literal
 
 from mushpipe.core.errors import InputError
-from mushpipe.core.recording import Index, RecordingReader
+from mushpipe.core.recording import Raw
 from mushpipe.sources.decoding import Decoder
 from mushpipe.sources.images import kind_of
-from mushpipe.sources.topics import images_of
 
 Role = Literal["color", "depth"]
 _CALLED = {"color": "colour", "depth": "depth"}
 
 
-def require_kind(reader: RecordingReader, index: Index, role: Role, topic: str | None) -> None:
+def require_kind(name: str, role: Role, first: Raw | None, images: Iterable[Raw]) -> None:
     """Refuse a topic that holds the other kind of images, and say which ones hold what is wanted.
+
+    Args:
+        name: What messages call the recording.
+        role: What the topic is taken for.
+        first: Its first message, if there is any.
+        images: The first message of each topic of images; looked at only to refuse.
 
     Raises:
         InputError: It does.
     """
-    held = _kind_on(reader, topic) if topic is not None else ""
-    if held in ("", role):
+    held = _held(first) if first else ""
+    if first is None or held in ("", role):
         return
-    fit = [each for each in images_of(index) if _kind_on(reader, each) == role]
-    cure = " or ".join(f"--set source.{role}_topic={each}" for each in fit)
+    fit = [raw.channel.topic for raw in images if _held(raw) == role]
+    cure = " or ".join(f"--set source.{role}_topic={topic}" for topic in fit)
     raise InputError(
-        f"{reader.path}: topic '{topic}' holds {_CALLED[held]}, expected {_CALLED[role]}; "
-        f"{cure or f'no topic holds {_CALLED[role]}'}"
+        f"{name}: topic '{first.channel.topic}' holds {_CALLED[held]}, expected {_CALLED[role]}; "
+        f"{cure or f'no topic is known to hold {_CALLED[role]}'}"
     )
 
 
-def _kind_on(reader: RecordingReader, topic: str) -> str:
-    """Return what the first message of a topic is an image of, "" where that is not told."""
-    first = next(reader.messages({topic}), None)
+def _held(raw: Raw) -> str:
+    """Return what a message is an image of, "" where that is not told."""
     try:
-        return kind_of(Decoder().decode(first)) if first else ""
+        return kind_of(Decoder().decode(raw))
     except Exception:  # whatever a decoder makes of foreign bytes: it is told where it is played
         return ""

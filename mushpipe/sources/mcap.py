@@ -6,6 +6,8 @@ import logging
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from functools import partial
+from itertools import islice
 from pathlib import Path
 
 from pydantic import Field, PrivateAttr
@@ -13,13 +15,13 @@ from pydantic import Field, PrivateAttr
 from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.geometry import Camera
 from mushpipe.core.paths import GraphPath
-from mushpipe.core.recording import GRAPH, MANIFEST, Index, RecordingReader
+from mushpipe.core.recording import GRAPH, MANIFEST, Index, Raw, RecordingReader
 from mushpipe.core.stage import ReplaySource
 from mushpipe.core.types import RgbdFrame
 from mushpipe.sources.kinds import require_kind
 from mushpipe.sources.playing import Player, beside_of
 from mushpipe.sources.recorded import NO_CAMERA, NO_DEPTH, RecordedSource
-from mushpipe.sources.topics import Topics, choose_topics, untold_images
+from mushpipe.sources.topics import Topics, choose_topics, images_of, untold_images
 
 logger = logging.getLogger("mushpipe")
 
@@ -67,8 +69,9 @@ class McapSource(RecordedSource, ReplaySource):
         index = reader.index()
         if not index.counts and reader.damage:
             raise InputError(f"{self.path}: {'; '.join(reader.damage)}; nothing could be read")
-        require_kind(reader, index, "color", self.color_topic)
-        require_kind(reader, index, "depth", self.depth_topic)
+        first, images = partial(_firsts, reader, index), images_of(index)
+        require_kind(str(self.path), "color", next(first(self.color_topic), None), first(*images))
+        require_kind(str(self.path), "depth", next(first(self.depth_topic), None), first(*images))
         named = (self.color_topic, self.depth_topic, self.camera_topic)
         return index, choose_topics(index, self.path, *named, self.use_depth)
 
@@ -148,6 +151,13 @@ class McapSource(RecordedSource, ReplaySource):
             raise InputError(f"{self.path}: {'; '.join(faults)}; {delivered} frames could be read")
         if not delivered:
             raise InputError(f"{self.path}: there is no frame in the chosen range")
+
+
+def _firsts(reader: RecordingReader, index: Index, *topics: str | None) -> Iterator[Raw]:
+    """Yield the first message of each topic that has any."""
+    for topic in topics:
+        if topic is not None and index.counts[topic]:
+            yield from islice(reader.messages({topic}), 1)
 
 
 def _watched(frames: Iterable[RgbdFrame], path: Path) -> Iterator[RgbdFrame]:

@@ -26,10 +26,11 @@ from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.paths import real
 from mushpipe.core.recording import GARBAGE, MANIFEST, Raw
 from mushpipe.core.types import RgbdFrame
+from mushpipe.sources.kinds import require_kind
 from mushpipe.sources.pairing import Pairing
 from mushpipe.sources.playing import Player, beside_of
 from mushpipe.sources.recorded import NO_CAMERA, NO_DEPTH, RecordedSource
-from mushpipe.sources.topics import Topics
+from mushpipe.sources.topics import NOT_CAMERA, Topics
 
 logger = logging.getLogger("mushpipe")
 _POLL_S = 0.1
@@ -123,6 +124,7 @@ class StreamSource(RecordedSource):
         reader = _Messages(self._records)
         messages = iter(reader)
         head = self._head(messages, reader, topics)
+        _require_kinds(head, topics)
         first = topics
         if topics.depth not in {raw.channel.topic for raw in head}:
             first = replace(topics, depth=None)
@@ -145,18 +147,19 @@ class StreamSource(RecordedSource):
             raise InputError(self._nothing_on(topics.color, reader))
 
     def _head(self, messages: Iterator[Raw], reader: _Messages, topics: Topics) -> list[Raw]:
-        """Return the messages up to the first depth, or up to where there seems to be none.
+        """Return the messages up to colour and depth, or up to where there seems to be no depth.
 
         A recording that is sent can wait as long as its images would for their depth; the images
         of a camera would grow old.
         """
-        head, size = list[Raw](), 0
+        head, size, deep = list[Raw](), 0, False
         most = 2 if self.live else Pairing.PATIENCE + 1
         for raw in messages:
             head.append(raw)
             size += len(raw.message.data)
             colored = _count(head, topics.color)
-            if raw.channel.topic == topics.depth or colored == (most if topics.depth else 2):
+            deep |= raw.channel.topic == topics.depth
+            if colored and (deep or colored == (most if topics.depth else 2)):
                 break
             if not colored and size > _MOST_BEFORE:
                 raise InputError(self._nothing_on(topics.color, reader))
@@ -177,6 +180,18 @@ class StreamSource(RecordedSource):
 
 def _count(messages: list[Raw], topic: str) -> int:
     return sum(raw.channel.topic == topic for raw in messages)
+
+
+def _require_kinds(head: list[Raw], topics: Topics) -> None:
+    """Refuse a topic that holds the other kind of images: none would come for as long as it lasts.
+
+    Raises:
+        InputError: It does.
+    """
+    firsts = {raw.channel.topic: raw for raw in reversed(head)}
+    images = [raw for topic, raw in firsts.items() if not topic.startswith(NOT_CAMERA)]
+    require_kind("the stream", "color", firsts.get(topics.color), images)
+    require_kind("the stream", "depth", firsts.get(topics.depth or ""), images)
 
 
 def _of_interest(messages: Iterable[Raw], player: Player, topics: Topics) -> Iterator[Raw]:

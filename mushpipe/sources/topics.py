@@ -18,7 +18,7 @@ IMAGES = {
     "foxglove.CompressedImage",
 }
 CALIBRATIONS = {"sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration"}
-_NOT_CAMERA = (RESULT_PREFIX, "/truth/")
+NOT_CAMERA = (RESULT_PREFIX, "/truth/")
 ALIGNED = "aligned_depth_to_color"
 _WORDS = {"depth": ("depth",), "infra": ("infra",), "color": ("color", "colour", "rgb")}
 # What else parts of a topic say of the images, and not of the camera.
@@ -100,7 +100,7 @@ def _check_named(index: Index, path: Path, topic: str, kinds: set[str]) -> None:
 
 def _topics(index: Index, schemas: set[str]) -> list[str]:
     named = sorted(t for t in index.channels if index.schema_name(t) in schemas)
-    return [t for t in named if index.counts[t] and not t.startswith(_NOT_CAMERA)]
+    return [t for t in named if index.counts[t] and not t.startswith(NOT_CAMERA)]
 
 
 def _kind(topic: str) -> str:

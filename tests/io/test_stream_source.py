@@ -26,7 +26,7 @@ from mushpipe.core.errors import (
 from mushpipe.core.paths import STDIO
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.recording import MANIFEST
-from mushpipe.core.wire import Message, Schema
+from mushpipe.core.wire import COLOR_TOPIC, DEPTH_TOPIC, Message, Schema
 from mushpipe.sources import stream as module
 from mushpipe.sources.mcap import McapSource
 from mushpipe.sources.realsense_frames import Clock
@@ -245,6 +245,38 @@ def test_a_sender_without_images_is_not_listened_to_for_ever(
     threading.Thread(target=os.write, args=(end, data), daemon=True).start()
     source.open()
     with pytest.raises(InputError, match="no colour images on /left"):
+        list(source.frames())
+    os.close(source._number)
+
+
+@pytest.mark.parametrize(
+    ("named", "said"),
+    [
+        (
+            {"color_topic": DEPTH_TOPIC, "depth_topic": "/none"},
+            f"'{DEPTH_TOPIC}' holds depth, expected colour; --set source.color_topic={COLOR_TOPIC}",
+        ),
+        (
+            {"color_topic": "/none", "depth_topic": COLOR_TOPIC},
+            "no colour images on /none",
+        ),
+        (
+            {"color_topic": COLOR_TOPIC, "depth_topic": COLOR_TOPIC},
+            f"'{COLOR_TOPIC}' holds colour, expected depth; no topic is known to hold depth",
+        ),
+    ],
+)
+def test_a_topic_of_the_other_kind_is_refused_while_its_sender_goes_on(
+    named: dict[str, str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of a recording; else a camera would be listened to without a frame or a word."""
+    data = stream(tmp_path / "s.mcap", 9).read_bytes()
+    monkeypatch.setattr(module, "_MOST_BEFORE", len(data) // 4)
+    source = StreamSource.model_validate(named)
+    source._number, end = os.pipe()  # which stays open
+    threading.Thread(target=os.write, args=(end, data), daemon=True).start()
+    source.open()
+    with pytest.raises(InputError, match=said):
         list(source.frames())
     os.close(source._number)
 

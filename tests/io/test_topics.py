@@ -227,7 +227,7 @@ def test_of_a_topic_that_holds_the_other_kind_the_right_one_is_told(
 
 def test_where_no_topic_holds_depth_it_is_said(tmp_path: Path) -> None:
     text = refusal(tmp_path, [color_at(0)], depth_topic=COLOR)
-    assert text == f"topic '{COLOR}' holds colour, expected depth; no topic holds depth"
+    assert text == f"topic '{COLOR}' holds colour, expected depth; no topic is known to hold depth"
 
 
 def test_unaligned_depth_is_refused_with_a_way_out(tmp_path: Path) -> None:
