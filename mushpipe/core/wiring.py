@@ -20,8 +20,9 @@ _SHARE = "plugins share a type that they import from one package, or define in o
 def wire(document: Document, registry: Registry, nodes: list[Node]) -> list[Problem]:
     """Fill the links of all nodes, given source first, then stages, then sinks, in file order.
 
-    An output that nobody takes becomes a warning of the document, and so do locations or poses
-    that are of other circles than those they come together with.
+    An output that nobody takes becomes a warning of the document, and so do an input that is left
+    open though a stage above takes one of that name, and locations or poses that are of other
+    circles than those they come together with.
     """
     problems = _check_names(document, nodes)
     for position, node in enumerate(nodes):
@@ -42,6 +43,7 @@ def wire(document: Document, registry: Registry, nodes: list[Node]) -> list[Prob
             problems += [problem] if problem else []
     if not problems:
         _warn_unused(document, nodes)
+        _warn_open(document, nodes)
         _warn_mixed(document, nodes)
     return problems
 
@@ -168,6 +170,21 @@ def _warn_unused(document: Document, nodes: list[Node]) -> None:
     for node in nodes:
         if node.kind == "stage" and node.name not in used:
             document.warnings.append(f"nobody takes what '{node.name}' produces")
+
+
+def _warn_open(document: Document, nodes: list[Node]) -> None:
+    taken: dict[tuple[str, type], tuple[str, str]] = {}
+    for node in nodes:
+        for port in node.ports.inputs:
+            key = (port.name, port.type)
+            if port.name in node.links:
+                taken[key] = node.name, node.links[port.name].producer
+            elif key in taken:
+                other, producer = taken[key]
+                document.warnings.append(
+                    f"'{node.name}' goes without '{port.name}', which '{other}' takes from "
+                    f"'{producer}': 'inputs: {{{port.name}: {producer}}}' gives it that as well"
+                )
 
 
 def _warn_mixed(document: Document, nodes: list[Node]) -> None:

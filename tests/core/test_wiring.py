@@ -502,6 +502,22 @@ def test_what_was_found_in_other_circles_is_a_warning(lab: Lab):
     assert len(warnings("both", Locate, Fit, Pick)) == 1  # only the poses are older
 
 
+def test_an_input_left_open_that_a_stage_above_takes_is_a_warning(lab: Lab):
+    class Detect(Stage):
+        def process(self, frame: RgbdFrame, learned: Circles | None = None) -> Circles: ...
+
+    class Fit(Stage):
+        def process(self, circles: Circles, learned: Circles | None = None) -> Circles: ...
+
+    lab.registry.stage("fit", Fit)
+    said = "'c' goes without 'learned', which 'b' takes from 'a': 'inputs: {learned: a}' gives it"
+    text = lab.chain("both", Detect, "fit")
+    assert lab.compile(text).warnings == (f"{said} that as well",)
+    told = text.replace("{use: fit}", "{use: fit, inputs: {learned: a}}")
+    assert lab.compile(told).warnings == ()
+    assert lab.compile(lab.chain("both", "fit", "fit")).warnings == ()  # no stage is given any
+
+
 FAULTS = {
     "nobody produces it": (
         "b: {use: invert}",
