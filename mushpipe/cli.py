@@ -224,7 +224,7 @@ def schema(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="file to write")] = None,
 ) -> None:
     """Print the JSON Schema of graph files, for completion in an editor."""
-    from mushpipe.core.overwriting import require_writable
+    from mushpipe.core.overwriting import require_writable, write_text
     from mushpipe.core.plugins import load_registry
     from mushpipe.core.schema import graph_schema
 
@@ -233,7 +233,7 @@ def schema(
     if out is None:
         _out(text)
     else:
-        out.write_text(text + "\n")
+        write_text(out, text + "\n")
 
 
 @plugins_app.command("list")

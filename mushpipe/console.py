@@ -21,7 +21,7 @@ from rich.table import Table
 
 from mushpipe.core.errors import EXIT_INTERRUPTED
 from mushpipe.core.files import files_read
-from mushpipe.core.overwriting import require_writable, spare
+from mushpipe.core.overwriting import require_writable, spare, write_text
 from mushpipe.core.plan import Plan
 from mushpipe.core.report import RunReport
 from mushpipe.core.run import run
@@ -109,7 +109,7 @@ def execute(
             spare(manifest, *report.files)
             manifest.parent.mkdir(parents=True, exist_ok=True)
             content = {**report.manifest, "result": report.summary()}
-            manifest.write_text(json.dumps(content, indent=2) + "\n")
+            write_text(manifest, json.dumps(content, indent=2) + "\n")
             stderr.print(f"manifest: {manifest}", style="dim")
     finally:  # a full disk takes no manifest either, and is not what went wrong first
         if report.error is not None:

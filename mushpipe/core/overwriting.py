@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from io import FileIO
 from pathlib import Path
 
-from mushpipe.core.errors import UsageError
+from mushpipe.core.errors import MushpipeError, UsageError
 from mushpipe.core.paths import real
 
 
@@ -43,6 +43,20 @@ def require_writable(out: Path | None, with_folder: bool = False) -> None:
     """
     if out is not None and (fault := _fault(out, with_folder)):
         raise UsageError(f"{out} cannot be written: {fault}")
+
+
+def write_text(out: Path, text: str) -> None:
+    """Write a file of text.
+
+    Raises:
+        MushpipeError: It cannot be written, or not all of it.
+    """
+    try:
+        out.write_text(text, encoding="utf-8")
+    except OSError as error:  # of a full disk, it names no file
+        raise MushpipeError(
+            f"{out}: not written to its end: {error.strerror}; make room, or give another path"
+        ) from error
 
 
 def make_folder(folder: Path) -> None:

@@ -178,7 +178,8 @@ class _Output:
             return "the program that reads the stream has ended"
         if self._path == STDIO:
             return f"the stream cannot be written: {error.strerror}"
-        return f"{self._path}: {error.strerror}; it plays up to its last whole chunk"
+        kept = "it plays up to its last whole chunk; make room, or record elsewhere"
+        return f"{self._path}: {error.strerror}; {kept}"
 
     def tell(self) -> int:
         return self._size

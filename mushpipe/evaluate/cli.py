@@ -86,7 +86,7 @@ def calibrate_depth(
     seed: SeedOption = 0,
 ) -> None:
     """Find what `depth-correct` must take off, from planes at known distances."""
-    from mushpipe.core.overwriting import require_writable, spare
+    from mushpipe.core.overwriting import require_writable, spare, write_text
     from mushpipe.evaluate.calibrate import fit_correction
     from mushpipe.evaluate.plane import judge_planes
     from mushpipe.evaluate.show import plane_table
@@ -98,7 +98,7 @@ def calibrate_depth(
     _print([plane_table(rows)])
     _write(correction.fragment())
     if out is not None:
-        out.write_text(correction.fragment())
+        write_text(out, correction.fragment())
 
 
 def evaluate(

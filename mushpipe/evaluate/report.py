@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mushpipe.core.overwriting import write_text
 from mushpipe.core.types import RgbdFrame
 from mushpipe.evaluate.command import Comparison, Judgement, Section
 from mushpipe.evaluate.events import Verdict
@@ -53,7 +54,7 @@ def write_report(judgement: Judgement, folder: Path) -> Path:
     """Write ``index.html`` into a folder and return its path."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "index.html"
-    path.write_text(page(judgement), encoding="utf-8")
+    write_text(path, page(judgement))
     return path
 
 

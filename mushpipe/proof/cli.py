@@ -115,7 +115,7 @@ def bench(
     from mushpipe.core.errors import EXIT_DIFFERS
     from mushpipe.core.files import files_read
     from mushpipe.core.graph import compile_document
-    from mushpipe.core.overwriting import require_writable, spare
+    from mushpipe.core.overwriting import require_writable, spare, write_text
     from mushpipe.core.plugins import load_registry
     from mushpipe.proof.bench import bench as measure
     from mushpipe.proof.bench import changes, conditions, read_baseline, slower
@@ -138,7 +138,7 @@ def bench(
     ratios = slower(result, before) if before else {}
     _show(result, ratios)
     if out is not None:
-        out.write_text(json.dumps(result, indent=2) + "\n")
+        write_text(out, json.dumps(result, indent=2) + "\n")
     too_slow = {name: ratio for name, ratio in ratios.items() if ratio > allow}
     for name, ratio in too_slow.items():
         logging.getLogger("mushpipe").error(

@@ -140,7 +140,7 @@ class RerunSink(Sink):
         sinks: list[Any] = []
         if self.save:
             self._path = run.path(self.save)
-            self._require_room()
+            self._require_room("nothing is written")
             sinks.append(rr.FileSink(str(self._path), write_footer=self.index))
         sinks += [rr.GrpcSink(url) for url in self._viewers()]
         # An id of its own for every run: those that share one are a single recording to a viewer.
@@ -183,12 +183,12 @@ class RerunSink(Sink):
             logger.info("look at it with: rerun %s", urls[-1])
         return urls
 
-    def _require_room(self) -> None:
+    def _require_room(self, kept: str) -> None:
         folder = self._path and self._path.parent
         if folder and folder.is_dir() and shutil.disk_usage(folder).free < ROOM_BYTES:
             raise RecordingError(
                 f"{self._path}: there are less than {ROOM_BYTES // 10**6} MB left on its disk; "
-                "the file ends here and can be opened"
+                f"{kept}; make room, or save elsewhere"
             )
 
     def consume(self, trace: Trace) -> None:
@@ -203,7 +203,7 @@ class RerunSink(Sink):
 
         if self._recording is None or self._memories is None:
             raise RuntimeError("the sink is not open")
-        self._require_room()
+        self._require_room("the file ends here and can be opened")
         rec, header, (images, results) = self._recording, trace.frame.header, self._memories
         rerun_log.set_frame(rec, header)
         self._last = header

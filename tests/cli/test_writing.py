@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from mushpipe import RunInfo
-from mushpipe.core.errors import EXIT_USAGE
+from mushpipe.core.errors import EXIT_FAILED, EXIT_USAGE
 from mushpipe.sinks.mcap import McapSink
 from mushpipe.sinks.rerun import RerunSink
 from tests.cli.shell import MAIN, ROOT, mushpipe
@@ -32,6 +32,20 @@ def test_a_recording_is_never_written_over_by_its_own_run(recorded: Path) -> Non
     assert done.returncode == EXIT_USAGE
     assert "sink 'log' would write over what is read" in done.stderr
     assert (recorded / "a.mcap").read_bytes() == before
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a full device")
+def test_of_a_manifest_that_does_not_fit_it_is_told_which_file_it_is(recorded: Path) -> None:
+    """The system's own error names no file then."""
+    done = mushpipe(
+        *("run", "graph.yaml", "--source", "a.mcap", "--set", "log.path=./out.mcap"),
+        *("--manifest", "/dev/full"),
+        cwd=recorded,
+    )
+    assert done.returncode == EXIT_FAILED
+    told = "/dev/full: not written to its end: No space left on device; make room, or give another"
+    assert f"error: {told} path\n" in done.stderr
+    assert (recorded / "out.mcap").stat().st_size
 
 
 def test_a_run_writes_over_neither_its_graph_nor_its_plugins(recorded: Path) -> None:

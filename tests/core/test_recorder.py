@@ -53,7 +53,7 @@ def test_after_a_full_disk_nothing_is_written_even_when_there_is_room_again(
     with pytest.raises(RecordingError) as caught:
         record()
     told = f"{path}: No space left on device; it plays up to its last whole chunk"
-    assert str(caught.value) == told
+    assert str(caught.value) == f"{told}; make room, or record elsewhere"
     disk.room = 10**9
     for _ in range(3):
         with pytest.raises(RecordingError, match="No space left"):

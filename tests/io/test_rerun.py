@@ -46,15 +46,19 @@ def test_runs_of_one_recording_are_told_apart_by_viewers(tmp_path: Path) -> None
 def test_a_disk_that_is_all_but_full_ends_the_file_and_hangs_nobody(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    free = iter([ROOM_BYTES, ROOM_BYTES, ROOM_BYTES - 1])
+    free = iter([ROOM_BYTES, ROOM_BYTES, ROOM_BYTES - 1, ROOM_BYTES - 1])
     left = lambda _: SimpleNamespace(free=next(free))  # noqa: E731
     monkeypatch.setattr(module.shutil, "disk_usage", left)
     sink = RerunSink.model_validate({"save": tmp_path / "run.rrd"})
     sink.open(RunInfo("test", {}))
     sink.consume(trace_of(make_frame(0)))
-    with pytest.raises(RecordingError, match=r"run\.rrd: there are less than 64 MB left"):
+    full = r"run\.rrd: there are less than 64 MB left on its disk"
+    with pytest.raises(RecordingError, match=f"{full}; the file ends here and can be opened"):
         sink.consume(trace_of(make_frame(1)))
     sink.close()
+    assert read(tmp_path / "run.rrd")[f"{IMAGE}/color"]["frame"] == [10]
+    with pytest.raises(RecordingError, match=f"{full}; nothing is written"):
+        RerunSink.model_validate({"save": tmp_path / "run.rrd"}).open(RunInfo("test", {}))
     assert read(tmp_path / "run.rrd")[f"{IMAGE}/color"]["frame"] == [10]
 
 
