@@ -56,7 +56,9 @@ def read_settings(
     Raises:
         ValidationError: They are not as the plugin declares them.
     """
-    context = {"base": base, "from_shell": from_shell}
+    # validators know a setting by its attribute
+    shell = {known for name, known in settings_of(plugin).items() if name in from_shell}
+    context = {"base": base, "from_shell": shell}
     return plugin.model_validate_json(json.dumps(settings), strict=True, context=context)
 
 

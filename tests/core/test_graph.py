@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import AfterValidator, ConfigDict, Field, Json, computed_field
 
-from mushpipe import Mask, RgbdFrame, RunInfo, Sink, SinkPath, Stage
+from mushpipe import GraphPath, Mask, RgbdFrame, RunInfo, Sink, SinkPath, Stage
 from mushpipe.core.document import Document, parse_document, read_document
 from mushpipe.core.errors import GraphError
 from mushpipe.core.graph import compile_document
@@ -446,6 +446,18 @@ def test_paths_are_relative_to_the_graph_file_unless_the_shell_gives_them(lab: L
     assert str(given) == "bed.mcap"
     absolute = lab.compile(graph, "source.path=/data/bed.mcap").source.plugin.path
     assert str(absolute) == "/data/bed.mcap"
+
+
+def test_the_shell_means_its_own_folder_whatever_a_plugin_calls_the_path_within(lab: Lab):
+    class Table(Stage):
+        path: GraphPath = Field(alias="file", description="a table")
+
+        def process(self, frame: RgbdFrame) -> Mask: ...
+
+    lab.registry.stage("table", Table)
+    graph = "mushpipe: 1\nsource: {use: frames}\nstages: {a: {use: table, file: a.csv}}\n"
+    assert lab.compile(graph).stages[0].plugin.path == lab.folder / "a.csv"
+    assert str(lab.compile(graph, "a.file=b.csv").stages[0].plugin.path) == "b.csv"
 
 
 def test_a_tilde_is_the_home_folder_which_no_shell_puts_into_a_setting(
