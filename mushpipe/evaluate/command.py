@@ -10,6 +10,7 @@ from pathlib import Path
 
 from mushpipe.core.errors import EXIT_DAMAGED, EXIT_DIFFERS, EXIT_OK, InputError, UsageError
 from mushpipe.core.overwriting import spare
+from mushpipe.core.paths import real
 from mushpipe.core.plan import Plan
 from mushpipe.core.report import RunReport
 from mushpipe.evaluate.compare import differences
@@ -214,9 +215,7 @@ def _judge_graph(
     else:
         truths = _given_truth(request, max(1, len(recordings)))
     options = alternatives(request.matrix) if request.matrix else [Alternative("")]
-    evaluations = {
-        option.label: Evaluation(request.rules, label=option.label) for option in options
-    }
+    evaluations = {each.label: Evaluation(request.rules, label=each.label) for each in options}
     worst = EXIT_OK
     played: list[tuple[Path | None, str]] = [(None, "")]
     if recordings:
@@ -253,6 +252,7 @@ def _judge(
 
 
 def _with_truth(recordings: list[Path]) -> list[Path]:
+    recordings = [*{real(path): path for path in recordings}.values()]  # each counts once
     kept = [path for path in recordings if has_truth(path)]
     for path in recordings:
         if path not in kept:

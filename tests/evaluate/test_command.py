@@ -476,6 +476,13 @@ def test_recordings_may_follow_the_graph_and_folders_are_opened(
     assert only["overall"]["frames"] == 3
 
 
+def test_a_recording_that_its_folder_names_as_well_counts_once(graph: Path, tmp_path: Path) -> None:
+    content = judged(graph, tmp_path / "bed.mcap", tmp_path, "--frames", 1)
+    (only,) = content["alternatives"]
+    assert [r["name"] for r in only["recordings"]] == ["bed"]
+    assert only["overall"]["frames"] == 1
+
+
 def test_a_folder_without_recordings_may_be_one_of_images(graph: Path, tmp_path: Path) -> None:
     (tmp_path / "photos").mkdir()
     told = str(run(graph, "--recordings", tmp_path / "photos").exception)
