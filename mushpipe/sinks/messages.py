@@ -53,12 +53,12 @@ def _made(frame: RgbdFrame, last: RgbdFrame) -> Iterator[wire.Message]:
 
     Who reads them carries the others on; colour says where there is no depth to carry on.
     """
-    if frame.depth is None:
-        yield wire.encode_color(frame)._replace(suffix="/color", metadata=wire.NO_DEPTH)
-        return
-    if frame.color is not last.color:
-        yield wire.encode_color(frame)._replace(suffix="/color")
-    if frame.depth is not last.depth or frame.depth_scale != last.depth_scale:
+    flat = frame.depth is None
+    if frame.color is not last.color or (flat and last.depth is not None):
+        metadata = wire.NO_DEPTH if flat else {}
+        yield wire.encode_color(frame)._replace(suffix="/color", metadata=metadata)
+    changed = frame.depth is not last.depth or frame.depth_scale != last.depth_scale
+    if changed and not flat:
         yield wire.encode_depth(frame)._replace(suffix="/depth")
 
 

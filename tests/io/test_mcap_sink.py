@@ -147,6 +147,15 @@ def test_only_images_that_a_stage_made_are_recorded(tmp_path: Path) -> None:
     assert set(by_topic(few)) == {"/mushpipe/timing"}
 
 
+def test_colour_without_depth_is_recorded_once_though_stages_pass_it_on(tmp_path: Path) -> None:
+    frame = make_frame()
+    flat = replace(frame, depth=None)
+    path = record(tmp_path / "flat.mcap", [trace_of(flat, same=flat, again=replace(flat))])
+    assert set(by_topic(path)) == {COLOR, INFO, "/mushpipe/timing"}
+    path = record(tmp_path / "lost.mcap", [trace_of(frame, lost=flat, again=replace(flat))])
+    assert set(by_topic(path)) == {COLOR, DEPTH, INFO, "/mushpipe/timing", "/mushpipe/lost/color"}
+
+
 def test_chunks_are_compressed_at_the_fastest_usual_level(tmp_path: Path) -> None:
     """mcap's writer has no setting for it: this fails if it no longer calls what it is given."""
     path = record(tmp_path / "run.mcap", [trace_of(make_frame(i)) for i in range(3)])
