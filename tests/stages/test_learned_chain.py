@@ -23,6 +23,12 @@ BARE = {"scene": "lab", "count": 1, "clutter": 12}
 RUBBLE = {"pins": 0, "stumps": 6, "rubble": 120, "relief_mm": 3.0}
 
 
+def chained(frame: RgbdFrame, net: CapNet, detect: PhaseHough, fit: CapFit) -> Circles:
+    """What `graphs/pick.yaml` finds in a frame."""
+    mask, learned = net.process(frame)
+    return fit.process(frame, detect.process(frame, mask, learned), learned)[-1]
+
+
 @pytest.mark.slow
 def test_more_brown_caps_among_rubble_are_found_than_by_the_net_alone_and_refitted() -> None:
     settings = {"cap_color": "brown", "soil": 3.0, "rubble": 50, "relief_mm": 3.0, "count": 40}
@@ -54,9 +60,7 @@ def test_caps_near_the_camera_are_found_where_the_largest_radius_is_left_open(de
             near = {"distance": 0.25, "size_mm": (45, 75), "count": 12, "cap_color": color}
             frame = simulated(seed, width=640, height=480, shape_family="b", **near)
             seen = frame if depth else replace(frame, depth=None)
-            mask, learned = stage.process(seen)
-            circles = detect.process(seen, mask, learned)
-            _, _, circles = CapFit(min_score=0.5).process(seen, circles, learned)
+            circles = chained(seen, stage, detect, CapFit(min_score=0.5))
             truth = frame.attached[TRUTH_TOPIC]
             score.add(circles, truth, counted(truth, 60, 200))
         found[name] = score
@@ -119,8 +123,7 @@ def test_one_cap_among_clutter_is_found_with_depth_and_hardly_a_cup_is_fitted() 
     fit, score = CapFit(min_score=0.5), Score()
     for seed in range(81, 93):
         frame = simulated(seed, width=640, height=480, shape_family="b", **BARE)
-        mask, learned = net.process(frame)
-        circles = fit.process(frame, detect.process(frame, mask, learned), learned)[-1]
+        circles = chained(frame, net, detect, fit)
         truth = frame.attached[TRUTH_TOPIC]
         score.add(circles, truth, counted(truth, *RADII))
     assert score.right >= 10
@@ -145,8 +148,7 @@ def test_hardly_a_clod_is_taken_for_a_cap_where_there_are_few(
     ):
         scene = RUBBLE | {"count": count, "soil": soil, "cap_color": color}
         frame = simulated(seed, width=640, height=480, **scene)
-        mask, learned = net.process(frame)
-        circles = fit.process(frame, detect.process(frame, mask, learned), learned)[-1]
+        circles = chained(frame, net, detect, fit)
         truth = frame.attached[TRUTH_TOPIC]
         score.add(circles, truth, counted(truth, *RADII))
     assert score.right >= right
