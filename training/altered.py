@@ -1,8 +1,8 @@
 """Judge graphs/pick.yaml on altered real frames: `python -m training.altered FOLDER`.
 
 A labelled recording has few caps, and chance decides about those at the edge of what is found. So
-each of its frames is looked at in other light and colour, less sharp, noisier, turned and scaled:
-what is found then says more, and is to change little.
+each of its frames is looked at in other light and colour, less sharp, noisier, turned and scaled,
+and in `--draws` of each kind of worse depth: what is found then says more, and is to change little.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from mushpipe import RgbdFrame
 from mushpipe.core.arrays import Bytes, Floats
 from training.field import found_and_false, labelled_frames
 from training.net.judge import both
+from training.sensors import DAMAGES, worse
 
 SCALES = (0.6, 0.75, 1.3)
 
@@ -179,14 +180,33 @@ def table(title: str, case: Labelled, beside_depth: float) -> str:
     return "\n".join([*lines, f"| **all** | {' | '.join(cells)} |"])
 
 
+def depth_table(title: str, case: Labelled, beside_depth: float, draws: int) -> str:
+    """Return what is found of a frame in so many draws of each kind of worse depth, and of all."""
+    lines = [f"| {title} | depth |", "|---|---|"]
+    kinds = {name: [damage] for name, damage in DAMAGES.items()} | {"all of it": DAMAGES.values()}
+    for name, damages in kinds.items():
+        right, false = 0, 0
+        for seed in range(draws):
+            frame = worse(case.frame, np.random.default_rng(seed), damages)
+            found = found_and_false(both(frame, True, beside_depth), case.must, case.may)
+            right, false = right + found[0], false + found[1]
+        lines.append(f"| {name} | {right} of {draws * len(case.must)}, {false} false |")
+    return "\n".join(lines)
+
+
 def main() -> None:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--beside-depth", type=float, default=0.8, help="setting of cap-net")
+    parser.add_argument("--draws", type=int, default=20, help="of each kind of worse depth")
     arguments = parser.parse_args()
     for name, case in cases(arguments.folder):
         print(f"\n{table(name, case, arguments.beside_depth)}", flush=True)
+        if case.frame.depth is not None:
+            print(
+                f"\n{depth_table(name, case, arguments.beside_depth, arguments.draws)}", flush=True
+            )
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -10,17 +11,6 @@ import numpy as np
 
 from mushpipe import RgbdFrame
 from mushpipe.core.arrays import Singles
-
-
-def worse(frame: RgbdFrame, rng: np.random.Generator) -> RgbdFrame:
-    """Return a frame with mismatched, coarse, shifted, noisy depth that lacks edges and patches."""
-    if frame.depth is None:
-        return frame
-    depth = frame.depth.astype(np.float32) * np.float32(frame.depth_scale)
-    for damage in (_mismatched, _coarser, _shifted, _noisier, _without_edges, _with_holes):
-        depth = damage(depth, rng)
-    native = np.clip(np.rint(depth / frame.depth_scale), 0, 65535).astype(np.uint16)
-    return replace(frame, depth=native)
 
 
 def _mismatched(depth: Singles, rng: np.random.Generator) -> Singles:
@@ -83,3 +73,27 @@ def _with_holes(depth: Singles, rng: np.random.Generator) -> Singles:
     height, width = depth.shape
     cloud = _blurred((height, width), rng.uniform(2, 8), rng)
     return np.where(cloud > rng.uniform(1.5, 3.5), np.float32(0), depth)
+
+
+Damage = Callable[[Singles, np.random.Generator], Singles]
+DAMAGES: dict[str, Damage] = {
+    "mismatched": _mismatched,
+    "coarser": _coarser,
+    "shifted": _shifted,
+    "noisier": _noisier,
+    "without edges": _without_edges,
+    "with holes": _with_holes,
+}
+
+
+def worse(
+    frame: RgbdFrame, rng: np.random.Generator, damages: Iterable[Damage] = DAMAGES.values()
+) -> RgbdFrame:
+    """Return a frame with mismatched, coarse, shifted, noisy depth that lacks edges and patches."""
+    if frame.depth is None:
+        return frame
+    depth = frame.depth.astype(np.float32) * np.float32(frame.depth_scale)
+    for damage in damages:
+        depth = damage(depth, rng)
+    native = np.clip(np.rint(depth / frame.depth_scale), 0, 65535).astype(np.uint16)
+    return replace(frame, depth=native)

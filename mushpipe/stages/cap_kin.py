@@ -18,7 +18,8 @@ from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.discs import discs_of
 
 SURE = 0.9  # score of what is surely a cap,
-ALONE = 0.7  # where it is one by itself with such a chance
+ALONE = 0.7  # where it is one by itself with such a chance,
+TRUST = 0.6  # and all that have such a score are caps with such a chance in the mean
 FEWEST = 6  # of them: fewer do not tell what is usual
 WITHIN = 0.6  # of the radius: what lies there is no rim and no neighbour
 _STEPS = np.linspace(-1, 1, 15)
@@ -65,12 +66,13 @@ def sure_of(score: Floats, lone: Floats | None = None) -> Ints:
     Args:
         score: (N,) of `phase-hough`.
         lone: (N,) chance of each to be a cap by what is known of it alone, where there are fits.
-            Where it speaks for no more than half of the others, nothing is sure: a detector that
+            Where it is low for most of what has a high score, nothing is sure: a detector that
             takes clods for caps takes many of them.
     """
-    likely = score >= SURE
-    sure = np.flatnonzero(likely if lone is None else likely & (lone >= ALONE))
-    return sure if len(sure) >= FEWEST and 2 * len(sure) > likely.sum() else sure[:0]
+    chance = score if lone is None else lone
+    likely = np.flatnonzero(score >= SURE)
+    sure = likely[chance[likely] >= ALONE]
+    return sure if len(sure) >= FEWEST and chance[likely].mean() >= TRUST else sure[:0]
 
 
 def tones_of(color: Bytes, circles: Circles) -> Floats:

@@ -147,7 +147,9 @@ def test_what_is_surely_a_cap_is_so_by_the_detector_and_by_itself() -> None:
     assert sure_of(score).tolist() == list(range(20))
     lone[:9] = 0.6
     assert sure_of(score, lone).tolist() == list(range(9, 20))
-    lone[9] = 0.6  # half of them: it is not known what caps look like here
+    lone[:12] = 0.5  # noisy depth: less is known of each, but nothing speaks against the most
+    assert sure_of(score, lone).tolist() == list(range(12, 20))
+    lone[:12] = 0.05  # most are no caps: it is not known what caps look like here
     assert len(sure_of(score, lone)) == 0
     assert len(sure_of(score[15:], lone[15:])) == 0  # too few
 
