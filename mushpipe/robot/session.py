@@ -65,7 +65,9 @@ class JsonSession:
         self._last_word: Ending | None = None
 
     def handle(self, line: bytes, now: float) -> Outgoing | None:
-        """Answer a line of the client."""
+        """Answer a line of the client, unless another has its name and only its bye waits."""
+        if self._last_word == "replaced":
+            return None
         try:
             return self._answer(parse(line), now)
         except Refusal as refusal:

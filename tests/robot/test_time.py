@@ -314,3 +314,18 @@ def test_what_is_sent_is_the_result_that_was_looked_at() -> None:
     outgoing = iter(lambda: session.due(clock.now), None)
     lines = [json.loads(next(outgoing).data) for _ in range(4)]
     assert [line.get("seq") for line in lines if line["op"] == "targets"] == [2, 3]
+
+
+def test_a_client_whose_name_another_took_says_nothing_more_in_that_name() -> None:
+    """Its bye may wait for a kernel that takes no line, while lines of it are read."""
+    clock = FakeClock()
+    hub = Hub(Settings(), clock)
+    hub.publish(choice(), 1, 0, clock.now)
+    before, after = JsonSession(hub, 1), JsonSession(hub, 2)
+    for session in (before, after):
+        session.handle(b'{"op":"hello","version":"1.0","mode":"request","name":"r"}', clock.now)
+    accept = b'{"op":"ack","id":1,"target":"m0","result":"accepted"}'
+    assert before.handle(accept, clock.now) is None
+    assert not hub.ledger.hides(0)
+    assert after.handle(accept, clock.now) is not None
+    assert hub.ledger.hides(0)
