@@ -110,6 +110,12 @@ def _fold(coefficients: tuple[float, ...]) -> float:
     return float(real.min(initial=np.inf))
 
 
+def _short_of_fold(xy: Floats, coefficients: tuple[float, ...]) -> Floats:
+    """Return coordinates (..., 2); NaN from the fold on, where `brown` gives those of others."""
+    beyond = (xy**2).sum(axis=-1) >= _fold(coefficients)
+    return np.where(beyond[..., None], np.nan, xy)
+
+
 @dataclass(frozen=True)
 class Camera:
     """A pinhole camera with lens distortion; lengths in px.
@@ -166,19 +172,21 @@ class Camera:
         z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
         xy = points[..., :2] / z[..., None]
         if self.model in _FORWARD:
-            beyond = (xy**2).sum(axis=-1) >= _fold(self.coefficients)
-            xy = np.where(beyond[..., None], np.nan, brown(xy, self.coefficients))
+            xy = brown(_short_of_fold(xy, self.coefficients), self.coefficients)
         elif self.model == "inverse_brown_conrady":
             xy = brown_inverse(xy, self.coefficients)
         return np.asarray(xy * (self.fx, self.fy) + (self.cx, self.cy))
 
     def deproject(self, pixels: Floats, depth: Floats) -> Floats:
-        """Lift (..., 2) pixels at (...,) depths (z in metres) to (..., 3) points."""
+        """Lift (..., 2) pixels at (...,) depths (z in metres) to (..., 3) points.
+
+        NaN where the lens model does not hold.
+        """
         xy = (np.asarray(pixels, dtype=np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
         if self.model in _FORWARD:
             xy = brown_inverse(xy, self.coefficients)
         elif self.model == "inverse_brown_conrady":
-            xy = brown(xy, self.coefficients)
+            xy = brown(_short_of_fold(xy, self.coefficients), self.coefficients)
         z = np.asarray(depth, dtype=np.float64)[..., None]
         return np.concatenate([xy * z, z], axis=-1)
 

@@ -195,8 +195,9 @@ def _histograms(events: Events) -> Figure | None:
     figure, panels = _axes(columns, rows, WIDE, 2.1 * rows + 0.2)
     for axes, (label, x) in zip(panels, known.items(), strict=False):
         low, high = np.quantile(x, [0.005, 0.995])
-        low, high = (min(low, 0.0) - 1e-9, high + 1e-9) if (x >= 0).all() else (low, high)
-        axes.hist(np.clip(x, low, high), bins=32, color=BLUE, alpha=0.8)
+        low = min(low, 0.0) if (x >= 0).all() else low
+        ends = low - 1e-9, high + 1e-9  # also where errors differ by rounding alone
+        axes.hist(np.clip(x, *ends), bins=32, range=ends, color=BLUE, alpha=0.8)
         axes.axvline(float(np.median(x)), color=ORANGE, lw=1.4)
         axes.set_xlabel(label)
         axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))

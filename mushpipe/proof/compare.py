@@ -235,6 +235,8 @@ def _difference(a: Any, b: Any, tolerance: float, limit: float | None = None) ->
     if isinstance(a, np.ndarray):
         if len(a) != len(b):
             return f"{len(a)} pixels against {len(b)}"
+        if a.shape != b.shape:
+            return f"{a[0].size} channels against {b[0].size}"
         # unknown is the same only as unknown
         apart = (a != b) & ~((a != a) & (b != b))
         different = int(np.count_nonzero(apart.reshape(len(a), -1).any(axis=1)))

@@ -11,6 +11,13 @@ from types import TracebackType
 from typing import Any
 
 Message = dict[str, Any]
+# What waits in a computer that sleeps grows old, and CLOCK_MONOTONIC stands still meanwhile.
+_CLOCK = getattr(time, "CLOCK_BOOTTIME", None)
+
+
+def now_ms() -> float:
+    """Return milliseconds that never jump, from an arbitrary start."""
+    return 1000 * (time.monotonic() if _CLOCK is None else time.clock_gettime(_CLOCK))
 
 
 class RobotClient:
@@ -35,7 +42,7 @@ class RobotClient:
         tls: ssl.SSLContext | None = None,
         **hello: Any,
     ) -> None:
-        begun_ms = time.monotonic() * 1000
+        begun_ms = now_ms()
         self._socket = socket.create_connection((host, port), timeout_s)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         if tls is not None:
@@ -81,7 +88,7 @@ class RobotClient:
                 f"this is no robot socket of mushpipe: it says {line[:60]!r}"
             ) from None
         if "t_ms" in message:
-            ahead_ms = time.monotonic() * 1000 - message["t_ms"]
+            ahead_ms = now_ms() - message["t_ms"]
             self._ahead_ms = min(self._ahead_ms, ahead_ms)
             if (0 if message["op"] == "hello" else message.get("id")) == self._asked[0]:
                 self._ahead_ms = self._asked[1] - message["t_ms"]
@@ -102,7 +109,7 @@ class RobotClient:
 
     def _request(self, op: str, **fields: Any) -> int:
         self._id += 1
-        self._asked = self._id, time.monotonic() * 1000
+        self._asked = self._id, now_ms()
         self.send(op, id=self._id, **fields)
         return self._id
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hmac
 from typing import Protocol
 
-from mushpipe.robot.hub import Ending, Hub, Leaving
+from mushpipe.robot.hub import Ending, Hub, Leaving, Result
 from mushpipe.robot.messages import (
     HEARTBEAT_S,
     VERSION,
@@ -65,7 +65,9 @@ class JsonSession:
         self._last_word: Ending | None = None
 
     def handle(self, line: bytes, now: float) -> Outgoing | None:
-        """Answer a line of the client."""
+        """Answer a line of the client, unless another has its name and only its bye waits."""
+        if self._last_word == "replaced":
+            return None
         try:
             return self._answer(parse(line), now)
         except Refusal as refusal:
@@ -98,16 +100,17 @@ class JsonSession:
     def _stream(self, now: float) -> Outgoing | None:
         if self._hub.newest is None or self._hub.newest.seq == self._sent:
             return None
-        self._sent = self._hub.newest.seq
+        limit_s = self._hub.settings.max_age_s
         try:
-            return self._targets(now, self._hub.settings.max_age_s, 1000, None)
+            result = self._hub.fresh(now, limit_s)  # which may be newer already
         except Refusal:
             return None  # the heartbeat tells of a stall; nothing old is sent
+        self._sent = result.seq
+        return self._targets(result, now, limit_s, 1000, None)
 
     def _targets(
-        self, now: float, limit_s: float, most: int, identity: int | str | None
+        self, result: Result, now: float, limit_s: float, most: int, identity: int | str | None
     ) -> Outgoing:
-        result = self._hub.fresh(now, limit_s)
         line = self._hub.targets_line(result, now, most, limit_s, identity)
         return Outgoing(line, result.taken + min(limit_s, self._hub.settings.max_age_s))
 
@@ -157,7 +160,7 @@ class JsonSession:
         except Refusal as refusal:
             refusal.extra["id"] = message.id
             raise
-        return self._targets(now, limit_s, message.max, message.id)
+        return self._targets(result, now, limit_s, message.max, message.id)
 
     def _ack(self, message: Ack, now: float) -> Outgoing:
         number = int(message.target[1:])

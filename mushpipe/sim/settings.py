@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal, Self
 
 from pydantic import Field, model_validator
@@ -10,6 +11,7 @@ from mushpipe import Camera
 from mushpipe.core.group import Group
 
 FOCAL_PX = 617.0  # SR300 colour at 640x480, librealsense issue 10838
+SLANTED_DEG = 70  # off the vertical; what looks farther aside may pass the floor's edge
 
 
 class SceneSettings(Group):
@@ -92,6 +94,12 @@ class SceneSettings(Group):
                 raise ValueError(
                     f"{name} is {first}, {last}: expected {low} <= first <= last <= {high}"
                 )
+        aside = math.degrees(math.atan(self.height / 2 / self.camera().fy)) + self.camera_tilt_deg
+        if aside > SLANTED_DEG:
+            raise ValueError(
+                f"an image of {self.width}x{self.height} px looks up to {aside:.0f} degrees "
+                f"off the vertical, expected at most {SLANTED_DEG}: make it wider, or less high"
+            )
         return self
 
     def camera(self) -> Camera:

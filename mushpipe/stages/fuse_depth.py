@@ -106,7 +106,7 @@ class FuseDepth(Stage):
             or self._scale != frame.depth_scale
             or not all(0 <= now_ns - stamp <= LONGEST_NS for stamp in self._stamps_ns[:1])
         ):
-            memory = self._forget(frame)
+            memory, self._stamps_ns = self._forget(frame), ()
         held = sum(0 <= now_ns - stamp <= LONGEST_NS for stamp in self._stamps_ns)
         self._stamps_ns = (now_ns, *self._stamps_ns)[: self.frames - 1]
         noise = SIGMAS * self.depth_noise_mm / 1000 / frame.depth_scale

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mushpipe.core.arrays import Floats, Ints, Rows
+from mushpipe.core.arrays import Bools, Floats, Ints, Rows
 from mushpipe.core.tables import Circles, Columns, Locations, column
 from mushpipe.stages.pairs import assigned, distances
 
@@ -83,8 +83,7 @@ class Tracks:
         old, flat = _moved(self._known, new, image)
         deep = _deep(new, old)
         rows, columns = _assign(np.where(np.isfinite(deep), deep, flat), _resized(new, old))
-        latest = old.seen_ns[columns] == old.seen_ns.max(initial=0)
-        if 2 * latest.sum() < len(new) and _by_chance(flat[rows, columns]):
+        if 2 * _latest(old)[columns].sum() < len(new) and _by_chance(flat[rows, columns]):
             rows = columns = rows[:0]
         ids = new.id.copy()
         ids[rows] = old.id[columns]
@@ -102,6 +101,11 @@ class Tracks:
         latest = (self._known.seen_ns == self._last_ns) & (unseen_ns <= PAUSE_NS)
         self._known = self._known.take(np.flatnonzero(latest | (unseen_ns <= memory_ns)))
         self._last_ns = stamp_ns
+
+
+def _latest(old: Sightings) -> Bools:
+    """Return which (M,) were seen last: these come first, whatever was done to the clock."""
+    return np.asarray(old.seen_ns == old.seen_ns[:1])
 
 
 def _flat(new: Sightings, old: Sightings) -> Floats:
@@ -167,8 +171,8 @@ def _moved(old: Sightings, new: Sightings, image: tuple[int, int]) -> tuple[Sigh
     apart = _flat(new, shifted)
     near = apart <= 1
     # Of those seen before the last picture nobody knows whether they are still where they were.
-    latest = old.seen_ns == old.seen_ns.max()
-    in_view = (latest[:, None] & (shifted.center >= 0) & (shifted.center < image)).all(axis=1).sum()
+    latest = _latest(old)[:, None]
+    in_view = (latest & (shifted.center >= 0) & (shifted.center < image)).all(axis=1).sum()
     if near.any(axis=0).sum() < max(FEWEST, stayed + 1, 0.5 * in_view):
         return old, flat
     deep = (new.position[:, None] - old.position[None])[near]

@@ -251,3 +251,13 @@ def test_the_two_readings_of_a_d455s_lens_part_by_what_the_docs_say() -> None:
         camera = Camera(width, height, fx, fy, cx, cy, model, lens)
         found = camera.deproject(pixels, np.ones(len(pixels)))[:, :2]
         assert found == pytest.approx(rays, abs=2e-5)
+
+
+def test_a_pixel_beyond_the_fold_of_an_inverse_lens_has_no_ray():
+    """Its polynomial gives it that of a pixel within, hundreds of pixels away."""
+    lens = Camera(640, 480, 400, 400, 319.5, 239.5, "inverse_brown_conrady", (-0.6, 0, 0, 0, 0))
+    fold = (1 / 1.8) ** 0.5  # d/dr of r - 0.6 r^3 is 0
+    pixels = np.array([[319.5 + 400 * share * fold, 239.5] for share in (0.99, 1.01)])
+    within, beyond = lens.deproject(pixels, np.ones(2))
+    np.testing.assert_allclose(lens.project(within), pixels[0], atol=1e-6)
+    assert np.isnan(beyond[:2]).all()

@@ -15,7 +15,7 @@ import pytest
 
 from mushpipe.core.errors import EXIT_DIFFERS
 from mushpipe.evaluate.events import events_of, judge
-from mushpipe.evaluate.plots import _against_tilt, _stated
+from mushpipe.evaluate.plots import _against_tilt, _histograms, _stated
 from mushpipe.evaluate.results import of_picks
 from mushpipe.evaluate.truth import FrameTruth
 from tests.evaluate.scenes import (
@@ -28,6 +28,7 @@ from tests.evaluate.scenes import (
     write_results,
 )
 from tests.evaluate.test_command import judged, manifest_of, metrics, run
+from tests.evaluate.test_metrics import turned
 
 
 class Page(HTMLParser):
@@ -162,6 +163,17 @@ def test_the_plot_of_sigmas_shows_the_error_itself() -> None:
     np.testing.assert_allclose(square, 1, rtol=1e-6)
     np.testing.assert_allclose(root, np.sqrt((0.04 + 0.04 + 1) / 3))
     np.testing.assert_allclose(z2, (25 + 25 + 1) / 3, rtol=1e-6)
+
+
+def test_errors_that_differ_by_rounding_alone_have_a_histogram() -> None:
+    truth = bed(5)
+    axis = turned(truth.axis, 0.05, np.random.default_rng(0))
+    found = of_picks(picks_of(truth, axis=axis))
+    known = FrameTruth(truth, frame_id=FRAME)
+    figure = _histograms(events_of([judge("bed", ("index", 0), known, header(0), found)]))
+    assert figure is not None
+    shown = {axes.get_xlabel(): axes.containers[0] for axes in figure.axes if axes.containers}
+    assert sum(bar.get_height() for bar in shown["axis, degrees"]) == len(truth)
 
 
 def test_an_axis_that_is_flipped_is_in_the_plot_of_axis_errors() -> None:

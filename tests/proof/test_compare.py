@@ -243,6 +243,13 @@ def test_a_pixel_differs_however_many_of_its_channels_do() -> None:
     assert _difference(a, c, 0.0) == "1 of 100 pixels"
 
 
+@pytest.mark.parametrize("channels", [1, 4])
+def test_images_of_another_number_of_channels_differ_at_any_tolerance(channels: int) -> None:
+    """As PNG with and without transparency, or JPEG of gray; the format says neither."""
+    a, b = np.zeros((100, 3), np.uint8), np.zeros((100, channels), np.uint8)
+    assert _difference(a, b, 1.0) == f"3 channels against {channels}"
+
+
 @pytest.mark.parametrize("number", [2**53, 1_700_000_000_000_000_001])
 def test_large_integers_are_compared_exactly(number: int) -> None:
     same, other = ({"x": [each]} for each in (number, number + 1))

@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -167,6 +168,27 @@ def test_the_reference_client_sees_what_a_slow_network_held_back() -> None:
     assert late - fresh >= 600
 
 
+@pytest.mark.skipif(not hasattr(time, "CLOCK_BOOTTIME"), reason="no clock tells of sleep here")
+def test_what_waited_while_the_robots_computer_slept_is_late(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    slept_s, clock_gettime = 0.0, time.clock_gettime
+    monkeypatch.setattr(
+        "mushpipe.robot.client.time.clock_gettime",
+        lambda clock: clock_gettime(clock) + (slept_s if clock == time.CLOCK_BOOTTIME else 0),
+    )
+    lines: list[dict[str, Any]] = [
+        {"op": "hello", "version": "1.0", "t_ms": 0},
+        {"op": "heartbeat", "t_ms": 0},
+        {"op": "targets", "t_ms": 0, "valid_ms": 60_000},
+    ]
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        threading.Thread(target=serve_lines, args=(listening, lines), daemon=True).start()
+        with RobotClient(port=listening.getsockname()[1], mode="stream") as robot:
+            slept_s = 120.0
+            assert robot.too_late(robot.receive())
+
+
 @pytest.mark.parametrize(("after_ms", "still"), [(399, True), (401, False)])
 def test_the_reference_client_takes_no_targets_from_an_answer_that_was_too_long_on_the_way(
     after_ms: float, still: bool, monkeypatch: pytest.MonkeyPatch
@@ -178,9 +200,7 @@ def test_the_reference_client_takes_no_targets_from_an_answer_that_was_too_long_
         answer,
     ]
     moments = iter([0.0, 0.0, 0.0, 0.0])  # of the connection, both greetings, and the request
-    monkeypatch.setattr(
-        "mushpipe.robot.client.time.monotonic", lambda: next(moments, after_ms / 1000)
-    )
+    monkeypatch.setattr("mushpipe.robot.client.now_ms", lambda: next(moments, after_ms))
     with socket.create_server(("127.0.0.1", 0)) as listening:
         threading.Thread(target=serve_lines, args=(listening, lines), daemon=True).start()
         with RobotClient(port=listening.getsockname()[1]) as robot:
@@ -214,9 +234,7 @@ def test_a_stream_of_hours_over_clocks_that_drift_is_not_taken_for_late(
         {"op": "targets", "t_ms": hours + 300},
     ]
     now_ms = 0.0
-    monkeypatch.setattr(
-        "mushpipe.robot.client.time.monotonic", lambda: 7 + now_ms * (1 + 50e-6) / 1000
-    )
+    monkeypatch.setattr("mushpipe.robot.client.now_ms", lambda: 7000 + now_ms * (1 + 50e-6))
     with socket.create_server(("127.0.0.1", 0)) as listening:
         threading.Thread(target=serve_lines, args=(listening, lines, 9), daemon=True).start()
         with RobotClient(port=listening.getsockname()[1], mode="stream") as robot:

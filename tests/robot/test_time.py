@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import socket
+from dataclasses import replace
 from math import inf
 
 import pytest
@@ -11,11 +13,11 @@ from hypothesis import strategies as st
 
 from mushpipe.robot.clock import MEMORY_S, PACED_S, TOLERANCE_S, Clock, Lateness, Placer
 from mushpipe.robot.connection import Connection, Limits
-from mushpipe.robot.hub import Ending, Hub, Settings
+from mushpipe.robot.hub import Ending, Hub, Result, Settings
 from mushpipe.robot.ledger import Ledger
 from mushpipe.robot.messages import Refusal
-from mushpipe.robot.session import Outgoing
-from tests.robot.scene import FakeClock, choice
+from mushpipe.robot.session import JsonSession, Outgoing
+from tests.robot.scene import FRAME, FakeClock, choice
 
 
 def hidden(ledger: Ledger) -> set[int]:
@@ -288,3 +290,42 @@ def test_what_was_put_off_is_accepted_only_where_it_is_seen() -> None:
         ledger.apply("a", 1, "accepted", 0, visible=False, now=1800)
     assert ledger.apply("a", 1, "accepted", 0, visible=True, now=1801) == "removed"
     assert ledger.apply("a", 1, "accepted", 0, visible=False, now=1802) == "removed"  # its own
+
+
+class Hasty(Hub):
+    """A hub to which a result in another frame comes as soon as one was looked at."""
+
+    def fresh(self, now: float, max_age_s: float) -> Result:
+        result = super().fresh(now, max_age_s)
+        self.publish(replace(choice(1), frame="robot_base"), 2, 0, now)
+        return result
+
+
+def test_what_is_sent_is_the_result_that_was_looked_at() -> None:
+    clock = FakeClock()
+    hub = Hasty(Settings(), clock)
+    hub.publish(choice(), 1, 0, clock.now)
+    session = JsonSession(hub, 1)
+    session.handle(b'{"op":"hello","version":"1.0","mode":"stream"}', clock.now)
+    asked = b'{"op":"get_targets","id":1,"frame":"%s"}' % FRAME.encode()
+    answer = session.handle(asked, clock.now)
+    assert answer is not None
+    assert json.loads(answer.data)["frame"] == FRAME
+    outgoing = iter(lambda: session.due(clock.now), None)
+    lines = [json.loads(next(outgoing).data) for _ in range(4)]
+    assert [line.get("seq") for line in lines if line["op"] == "targets"] == [2, 3]
+
+
+def test_a_client_whose_name_another_took_says_nothing_more_in_that_name() -> None:
+    """Its bye may wait for a kernel that takes no line, while lines of it are read."""
+    clock = FakeClock()
+    hub = Hub(Settings(), clock)
+    hub.publish(choice(), 1, 0, clock.now)
+    before, after = JsonSession(hub, 1), JsonSession(hub, 2)
+    for session in (before, after):
+        session.handle(b'{"op":"hello","version":"1.0","mode":"request","name":"r"}', clock.now)
+    accept = b'{"op":"ack","id":1,"target":"m0","result":"accepted"}'
+    assert before.handle(accept, clock.now) is None
+    assert not hub.ledger.hides(0)
+    assert after.handle(accept, clock.now) is not None
+    assert hub.ledger.hides(0)

@@ -174,11 +174,20 @@ def test_missing_depth_and_a_gap_in_time():
         {"sensor": {"nois": 1}},
         {"color": {"jpeg_quality": 101}},
         {"lamps": 3},
+        {"width": 64, "height": 240, "camera_tilt_deg": 20},
     ],
 )
 def test_wrong_settings_are_refused(wrong):
     with pytest.raises(ValidationError):
         SyntheticSource(**wrong)
+
+
+def test_a_high_image_sees_ground_or_floor_everywhere():
+    high = {"width": 64, "height": 240, "camera_tilt_deg": 7, "distance": 2}
+    far = {"range_m": (0.2, 12), "unit_mm": 0.5, "random_holes": 0}
+    off = dict.fromkeys(("grazing", "shadow", "edges"), False)
+    (frame,) = frames(**high, scene="plane", sensor=far | off)
+    assert (frame.depth > 0).all()
 
 
 def test_every_setting_is_described():

@@ -82,6 +82,17 @@ def test_nothing_that_fills_a_hole_is_older_than_half_a_second(
     assert filled == min(frames - 1, 500 // period_ms)
 
 
+def test_stamps_that_come_twice_do_not_count_twice() -> None:
+    """The clock was set back by less than half a second: what was seen is 0.8 s old at the end."""
+    stage = FuseDepth()
+    whole, hole = np.full(SHAPE, 500, np.uint16), np.full(SHAPE, 500, np.uint16)
+    hole[3, 4] = 0
+    for k, at_ms in enumerate([0, 400, 800, 1200, 900, 1300, 1700]):
+        header = Header(at_ms * 1_000_000, k, "optical")
+        out = stage.process(replace(frame(whole if k < 5 else hole), header=header))
+    assert out.depth[3, 4] == 0
+
+
 def test_a_scene_that_moved_starts_anew() -> None:
     stage = FuseDepth()
     ramp = np.linspace(400, 600, 50).astype(np.float32) * np.ones(SHAPE, np.float32)

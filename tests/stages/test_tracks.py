@@ -119,6 +119,18 @@ def test_an_id_does_not_outlive_stamps_that_go_back() -> None:
     assert ids(tracks, here, at=12) == [2]
 
 
+def test_ids_follow_a_moving_camera_when_the_clock_is_set_back_within_the_memory() -> None:
+    """Two that went out of view before have later stamps than all the others."""
+    grid = [(24.0 * x + 14, 24.0 * y + 14, 0.5) for x in range(6) for y in range(4)]
+    tracks, now, memory = Tracks(), 100_000, 10_000
+    found = []
+    for step in range(6):
+        now += 33 if step != 2 else -2000
+        rows = [(u + 3.7 * step, v, z) for u, v, z in grid[2 * (step > 1) :]]
+        found.append(tracks.update(*seen(*rows), IMAGE, now, memory).tolist()[-22:])
+    assert found == [found[0]] * 6
+
+
 def test_a_jump_of_more_than_half_a_radius_is_another_mushroom() -> None:
     tracks = Tracks()
     ids(tracks, (50, 50, 0.5))
