@@ -80,7 +80,7 @@ def read_truth(path: Path) -> TruthSet:
     """Read the truth from a recording (``.mcap``) or from labels (any other file).
 
     Raises:
-        UsageError: There is no such file.
+        UsageError: There is no such file, or it is a folder.
         InputError: The file cannot be read, holds no truth, or is wrong.
     """
     return truth_of_recording(path) if path.suffix == ".mcap" else truth_of_labels(path)
@@ -122,7 +122,7 @@ def truth_of_labels(path: Path) -> TruthSet:
     """Read a file of labels in the project's format or a foreign one; see `labels`.
 
     Raises:
-        UsageError: There is no such file.
+        UsageError: There is no such file, or it is a folder.
         InputError: It is no JSON, or no such labels.
     """
     try:
@@ -132,6 +132,8 @@ def truth_of_labels(path: Path) -> TruthSet:
         labels = parse_labels(document)
     except FileNotFoundError:
         raise UsageError(f"{path}: there are no such labels") from None
+    except IsADirectoryError:
+        raise UsageError(f"{path}: it is a folder; labels are a file") from None
     except ValidationError as error:
         faults = list(map(_fault, error.errors()))
         raise InputError("\n  ".join([f"{path}: not valid labels:", *faults[:20]])) from error

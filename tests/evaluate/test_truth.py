@@ -230,6 +230,8 @@ def test_wrong_labels_are_refused_with_their_place(
 def test_files_that_are_not_there_or_no_json(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no such"):
         read_truth(tmp_path / "none.json")
+    with pytest.raises(UsageError, match="it is a folder"):
+        read_truth(tmp_path)
     (tmp_path / "bad.json").write_text("{")
     with pytest.raises(InputError, match="no labels"):
         read_truth(tmp_path / "bad.json")
