@@ -80,6 +80,9 @@ def compile_document(
         GraphError: With every problem found.
     """
     problems: list[Problem] = []
+    if {"graph", "graph_file"} <= document.data.keys():  # of which every setting would be unknown
+        manifest = "a run's manifest, and no graph: save what stands in it under 'graph'"
+        raise GraphError([Problem(document.file, 0, 0, manifest)])
     if source is not None:
         if (fault := encoding_fault(source)) is not None:
             raise GraphError([Problem(f"--source {source}", 0, 0, fault)])

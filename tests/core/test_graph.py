@@ -185,6 +185,10 @@ graph.yaml:1:1: setting 'source' is missing
     stages: {}
     ^""",
     ),
+    "the manifest of a run": (
+        "graph_file: demo.yaml\ngraph: {mushpipe: 1}\nversions: {}\n",
+        "graph.yaml: a run's manifest, and no graph: save what stands in it under 'graph'",
+    ),
     "another version": (
         "mushpipe: 2\nsource: {use: frames}\n",
         """graph.yaml:1:11: mushpipe: Input should be 1, got 2
