@@ -394,7 +394,7 @@ def test_a_value_that_a_list_lacks_is_counted(lab: Lab):
     [
         (
             "foo",
-            ["Input should be 'bed' or 'camera', got \"foo\"", "valid array"],
+            ["Input should be 'bed' or 'camera', got \"foo\"", "expected a list in brackets"],
         ),
         ("[1, 2]", ["Input should be 'bed' or 'camera', got [1, 2]", "value 3 is missing"]),
         ("[0, 0, 0]", ["the upright has no direction: a vector needs a component that is not 0"]),
