@@ -56,9 +56,9 @@ class GraphFile(BaseModel):
 
     @field_validator("mushpipe", mode="before")
     @classmethod
-    def _is_number(cls, value: Any) -> Any:
-        if isinstance(value, bool):  # YAML's yes, which equals 1
-            raise ValueError("Input should be 1")
+    def _is_read_here(cls, value: Any) -> Any:
+        if type(value) is not int or value != 1:  # YAML's yes equals 1
+            raise ValueError("expected 1, the version that this program reads")
         return value
 
 

@@ -97,7 +97,7 @@ FAULTS = {
     ),
     "a version that only equals 1": (
         "mushpipe: yes\nsource: {use: frames}\n",
-        """graph.yaml:1:11: mushpipe: Input should be 1, got true
+        """graph.yaml:1:11: mushpipe: expected 1, the version that this program reads, got true
     mushpipe: yes
               ^""",
     ),
@@ -191,7 +191,7 @@ graph.yaml:1:1: setting 'source' is missing
     ),
     "another version": (
         "mushpipe: 2\nsource: {use: frames}\n",
-        """graph.yaml:1:11: mushpipe: Input should be 1, got 2
+        """graph.yaml:1:11: mushpipe: expected 1, the version that this program reads, got 2
     mushpipe: 2
               ^""",
     ),
