@@ -269,11 +269,15 @@ register_proof(app)
 
 def main() -> None:
     """Entry point: errors meant for the user become one message and an exit code."""
+    import logging
+
     from mushpipe.core.closed import open_closed
     from mushpipe.core.errors import EXIT_INTERRUPTED, MushpipeError
     from mushpipe.core.interrupt import watch
 
     open_closed()
+    if logging.lastResort:  # of the verbs that set up no log: what they warn of is called a warning
+        logging.lastResort.setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
     faulthandler.enable(file=2)  # where native code of a plugin crashes, which one it was
     try:
         watch()
