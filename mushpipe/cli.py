@@ -132,7 +132,7 @@ def run(
     flags = source_overrides(frames=frames, start=start, end=end, speed=speed, loop=loop)
     more = ["foxglove"] if foxglove else []
     plan = _compile(graph, [*flags, *(set_ or [])], source, more)
-    repeated = graph.suffix == ".mcap" and source is None  # its frame is saved already
+    repeated = graph.suffix.lower() == ".mcap" and source is None  # its frame is saved already
     beside = manifest_of(graph) if repeated else manifest_path(plan)
     report = execute(plan, manifest or beside, None if repeated else capsules)
     if repeated and report.processed and report.exit_code == 0:

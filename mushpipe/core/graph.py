@@ -158,7 +158,7 @@ def _replace_source(document: Document, source: str, registry: Registry) -> None
         given = {"use": "stream"}
     elif is_name or in_file(source):
         given = {"use": source}
-    elif source.endswith(".bag"):
+    elif source.lower().endswith(".bag"):
         given = {"use": "realsense", "file": source}
     elif Path(source).is_dir():
         given = {"use": "images", "path": source}

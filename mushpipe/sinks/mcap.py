@@ -59,7 +59,7 @@ class McapSink(Sink):
     @field_validator("path")
     @classmethod
     def _plays_again(cls, path: Path) -> Path:
-        if path.name.endswith(".bag"):  # by which --source and people tell Intel's recordings
+        if path.name.lower().endswith(".bag"):  # by which --source tells Intel's
             raise ValueError("a recording is MCAP, and .bag one of Intel's viewer: name it .mcap")
         return path
 

@@ -18,6 +18,7 @@ from mushpipe.core.truth import TRUTH_TOPIC, Ignore
 from mushpipe.evaluate.judging import Rules, judge_results
 from mushpipe.evaluate.labels import EXAMPLE, convert, parse_labels
 from mushpipe.evaluate.results import Results, of_picks
+from mushpipe.evaluate.running import recordings_in
 from mushpipe.evaluate.truth import FrameTruth, TruthSet, has_truth, read_truth
 from mushpipe.sources.mcap import McapSource
 from tests.evaluate.scenes import FRAME, bed, header, picks_of, write_recording, write_results
@@ -252,6 +253,13 @@ def test_truth_of_a_recording(tmp_path: Path) -> None:
     frame = truth.frames["stamp_ns", header(1).stamp_ns]
     assert frame.frame_id == FRAME
     assert (frame.caps.apex == bed(1).apex).all()
+
+
+@pytest.mark.parametrize("name", ["BED.MCAP", "bed"])
+def test_a_recording_is_none_of_labels_whatever_its_name(tmp_path: Path, name: str) -> None:
+    path = write_recording(tmp_path / name, {0: bed(0)})
+    assert read_truth(path).recording == path
+    assert name == "bed" or recordings_in([tmp_path]) == [path]
 
 
 def test_labels_that_name_no_frame_are_in_that_of_the_camera(tmp_path: Path) -> None:

@@ -271,8 +271,9 @@ def test_the_path_takes_the_name_of_the_recording_and_its_folder_is_made(tmp_pat
 
 
 def test_a_name_that_would_not_be_played_as_what_it_is_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"name it \.mcap"):
-        McapSink(path=tmp_path / "row-7.bag")
+    for name in ("row-7.bag", "ROW-7.BAG"):
+        with pytest.raises(ValueError, match=r"name it \.mcap"):
+            McapSink(path=tmp_path / name)
 
 
 def test_a_header_without_arrival_time_is_logged_at_its_stamp(tmp_path: Path) -> None:
