@@ -132,7 +132,7 @@ def run(
     flags = source_overrides(frames=frames, start=start, end=end, speed=speed, loop=loop)
     more = ["foxglove"] if foxglove else []
     plan = _compile(graph, [*flags, *(set_ or [])], source, more)
-    repeated = graph.suffix == ".mcap" and source is None  # its frame is saved already
+    repeated = graph.suffix.lower() == ".mcap" and source is None  # its frame is saved already
     beside = manifest_of(graph) if repeated else manifest_path(plan)
     report = execute(plan, manifest or beside, None if repeated else capsules)
     if repeated and report.processed and report.exit_code == 0:
@@ -269,11 +269,15 @@ register_proof(app)
 
 def main() -> None:
     """Entry point: errors meant for the user become one message and an exit code."""
+    import logging
+
     from mushpipe.core.closed import open_closed
     from mushpipe.core.errors import EXIT_INTERRUPTED, MushpipeError
     from mushpipe.core.interrupt import watch
 
     open_closed()
+    if logging.lastResort:  # of the verbs that set up no log: what they warn of is called a warning
+        logging.lastResort.setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
     faulthandler.enable(file=2)  # where native code of a plugin crashes, which one it was
     try:
         watch()

@@ -86,11 +86,13 @@ def view(
     from mushpipe.console import interruptible, set_up_logging
     from mushpipe.core.errors import DependencyError, UsageError
     from mushpipe.core.overwriting import spare
+    from mushpipe.core.recording import RecordingReader
     from mushpipe.sinks.rerun import RerunSink
     from mushpipe.sinks.rerun_server import has_display
 
     set_up_logging(False)
     spare(save, file)
+    RecordingReader(file)  # that it is no recording is said before where it could be looked at
     spawn = save is None and serve is None
     if spawn and not has_display():
         raise DependencyError(

@@ -85,7 +85,7 @@ def read_document(path: Path, example: str = "mushpipe: 1") -> Document:
         message = f"not UTF-8: the byte 0x{error.object[error.start]:02x} ({error.reason})"
         raise GraphError([Problem(str(path), len(before), len(before[-1]) + 1, message)]) from error
     except OSError as error:
-        raise GraphError([Problem(str(path), 0, 0, f"cannot be read: {error}")]) from error
+        raise GraphError([Problem(str(path), 0, 0, f"cannot be read: {error.strerror}")]) from error
     return parse_document(text, str(path), path.parent, example)
 
 

@@ -39,6 +39,8 @@ def faults_of(
             message = item["msg"].removeprefix("Value error, ")
             if item["type"] == "dict_type" and not use:
                 message = _expected(path)
+            if item["type"] in ("list_type", "tuple_type"):  # of which pydantic says "array"
+                message = "expected a list in brackets, such as [a, b]"
             if item["type"] == "json_invalid":  # half a character: "\ud800", or of a name
                 what = what if use else "the graph"
                 message = "a text in it is not UTF-8: give the file another name"

@@ -56,9 +56,9 @@ class GraphFile(BaseModel):
 
     @field_validator("mushpipe", mode="before")
     @classmethod
-    def _is_number(cls, value: Any) -> Any:
-        if isinstance(value, bool):  # YAML's yes, which equals 1
-            raise ValueError("Input should be 1")
+    def _is_read_here(cls, value: Any) -> Any:
+        if type(value) is not int or value != 1:  # YAML's yes equals 1
+            raise ValueError("expected 1, the version that this program reads")
         return value
 
 
@@ -80,6 +80,9 @@ def compile_document(
         GraphError: With every problem found.
     """
     problems: list[Problem] = []
+    if {"graph", "graph_file"} <= document.data.keys():  # of which every setting would be unknown
+        manifest = "a run's manifest, and no graph: save what stands in it under 'graph'"
+        raise GraphError([Problem(document.file, 0, 0, manifest)])
     if source is not None:
         if (fault := encoding_fault(source)) is not None:
             raise GraphError([Problem(f"--source {source}", 0, 0, fault)])
@@ -155,7 +158,7 @@ def _replace_source(document: Document, source: str, registry: Registry) -> None
         given = {"use": "stream"}
     elif is_name or in_file(source):
         given = {"use": source}
-    elif source.endswith(".bag"):
+    elif source.lower().endswith(".bag"):
         given = {"use": "realsense", "file": source}
     elif Path(source).is_dir():
         given = {"use": "images", "path": source}

@@ -41,7 +41,8 @@ class OnnxFile:
 
     def __init__(self, path: Path) -> None:
         if not path.is_file():
-            raise UsageError(f"model {path}: there is no such file")
+            what = "it is a folder" if path.is_dir() else "there is no such file"
+            raise UsageError(f"model {path}: {what}")
         self.path = path
         # Frames with and without depth may differ in their sizes, and be looked at in several.
         self._session = lru_cache(maxsize=6)(self._opened)

@@ -36,6 +36,7 @@ GARBAGE = (
     *(McapError, ValueError, struct.error, ZstdError, RuntimeError, MemoryError, TypeError),
     *(OverflowError, LookupError, OSError),
 )
+MAGIC = b"\x89MCAP0\r\n"
 MANIFEST = "mushpipe.manifest"
 SUMMARY = "mushpipe.summary"
 GRAPH = "mushpipe.graph"
@@ -128,14 +129,14 @@ class RecordingReader:
             if path.is_dir():
                 raise UsageError(f"{path}: it is a folder{_recordings_in(path)}")
             with path.open("rb") as file:
-                magic = file.read(8)
+                magic = file.read(len(MAGIC))
         except FileNotFoundError:
             raise UsageError(f"{path}: there is no such recording") from None
         except OSError as error:
             raise InputError(f"{path}: cannot be read: {error.strerror}") from error
         if not magic:
             raise InputError(f"{path}: the file is empty")
-        if magic != b"\x89MCAP0\r\n":
+        if magic != MAGIC:
             known = [what for begin, what in _OTHERS.items() if magic.startswith(begin)]
             what = f"it is {known[0]}" if known else f"it begins with {magic!r}"
             raise InputError(f"{path}: not an MCAP file ({what})")

@@ -39,7 +39,7 @@ from mushpipe.evaluate.running import (
 )
 from mushpipe.evaluate.speed import named, speed_of
 from mushpipe.evaluate.thresholds import Outcome, check, parse_threshold, require_known
-from mushpipe.evaluate.truth import TruthSet, has_truth, read_truth
+from mushpipe.evaluate.truth import TruthSet, has_truth, read_truth, truth_of_recording
 
 logger = logging.getLogger("mushpipe")
 GRAPHS = (".yaml", ".yml")
@@ -211,7 +211,7 @@ def _judge_graph(
     truths: Sequence[TruthSet | None]
     if recordings and not request.truth:
         recordings = _with_truth(recordings)
-        truths = [read_truth(path) for path in recordings]
+        truths = [truth_of_recording(path) for path in recordings]
     else:
         truths = _given_truth(request, max(1, len(recordings)))
     options = alternatives(request.matrix) if request.matrix else [Alternative("")]

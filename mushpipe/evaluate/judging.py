@@ -11,7 +11,7 @@ from mushpipe.core.manifest import sha256
 from mushpipe.evaluate.events import UP, Events, Verdict, comparable, events_of, judge
 from mushpipe.evaluate.metrics import Value, measure
 from mushpipe.evaluate.results import Detections, Results
-from mushpipe.evaluate.truth import Place, TruthSet, has_truth, read_truth
+from mushpipe.evaluate.truth import Place, TruthSet, has_truth, truth_of_recording
 from mushpipe.traces import source_recording
 
 OPTICAL = "the camera's optical frame"  # of labels that name none
@@ -246,10 +246,10 @@ def find_truth(results: Results) -> TruthSet:
     stated = results.manifest.get("recordings") or [{}]
     path = source_recording(results.path, results.manifest)
     if (path is None or not has_truth(path)) and has_truth(results.path):
-        return read_truth(results.path)
+        return truth_of_recording(results.path)
     if path is None:
         of = f" of {stated[0]['file']}" if stated[0].get("file") else ""
         raise InputError(f"{results.path}: the truth{of} is not to be found; give it with --truth")
     if not has_truth(path):
         raise InputError(f"{path}: it carries no truth; give labels with --truth")
-    return read_truth(path)
+    return truth_of_recording(path)

@@ -64,7 +64,7 @@ def _split(values: str) -> list[str]:
 
 
 def recordings_in(paths: Sequence[Path]) -> list[Path]:
-    """Return the recordings that paths name; a folder stands for all ``*.mcap`` in it.
+    """Return the recordings that paths name; a folder stands for all ``*.mcap`` in it, or ``MCAP``.
 
     Raises:
         UsageError: A folder holds none, or may not be read.
@@ -72,7 +72,9 @@ def recordings_in(paths: Sequence[Path]) -> list[Path]:
     found: list[Path] = []
     for path in paths:
         require_listed(path)
-        files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+        files = [path]
+        if path.is_dir():
+            files = sorted(file for file in path.iterdir() if file.suffix.lower() == ".mcap")
         if not files:
             raise UsageError(
                 f"{path}: the folder holds no recordings (*.mcap); one of images is played by a "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -15,7 +16,7 @@ from pydantic_core import ErrorDetails
 
 from mushpipe.core.arrays import Floats
 from mushpipe.core.errors import InputError, UsageError, suggest
-from mushpipe.core.recording import RecordingReader
+from mushpipe.core.recording import MAGIC, RecordingReader
 from mushpipe.core.truth import TRUTH_TOPIC, Truth
 from mushpipe.core.types import Header
 from mushpipe.core.wire import decode_table
@@ -77,13 +78,20 @@ class TruthSet:
 
 
 def read_truth(path: Path) -> TruthSet:
-    """Read the truth from a recording (``.mcap``) or from labels (any other file).
+    """Read the truth from a recording, by its name (``.mcap``) or what is in it, or from labels.
 
     Raises:
-        UsageError: There is no such file.
+        UsageError: There is no such file, or it is a folder.
         InputError: The file cannot be read, holds no truth, or is wrong.
     """
-    return truth_of_recording(path) if path.suffix == ".mcap" else truth_of_labels(path)
+    recorded = path.suffix.lower() == ".mcap" or _is_recording(path)
+    return truth_of_recording(path) if recorded else truth_of_labels(path)
+
+
+def _is_recording(path: Path) -> bool:
+    with suppress(OSError), path.open("rb") as file:
+        return file.read(len(MAGIC)) == MAGIC
+    return False
 
 
 def has_truth(path: Path) -> bool:
@@ -122,7 +130,7 @@ def truth_of_labels(path: Path) -> TruthSet:
     """Read a file of labels in the project's format or a foreign one; see `labels`.
 
     Raises:
-        UsageError: There is no such file.
+        UsageError: There is no such file, or it is a folder.
         InputError: It is no JSON, or no such labels.
     """
     try:
@@ -132,6 +140,8 @@ def truth_of_labels(path: Path) -> TruthSet:
         labels = parse_labels(document)
     except FileNotFoundError:
         raise UsageError(f"{path}: there are no such labels") from None
+    except IsADirectoryError:
+        raise UsageError(f"{path}: it is a folder; labels are a file") from None
     except ValidationError as error:
         faults = list(map(_fault, error.errors()))
         raise InputError("\n  ".join([f"{path}: not valid labels:", *faults[:20]])) from error

@@ -7,6 +7,7 @@ import math
 import socket
 import ssl
 import time
+from contextlib import suppress
 from types import TracebackType
 from typing import Any
 
@@ -110,7 +111,8 @@ class RobotClient:
     def _request(self, op: str, **fields: Any) -> int:
         self._id += 1
         self._asked = self._id, now_ms()
-        self.send(op, id=self._id, **fields)
+        with suppress(BrokenPipeError, ConnectionResetError):  # why, it may have said before
+            self.send(op, id=self._id, **fields)
         return self._id
 
     def targets(self, **fields: Any) -> list[Message]:

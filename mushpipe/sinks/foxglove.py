@@ -52,7 +52,8 @@ class FoxgloveSink(Sink):
                 context=self._context,
             )
         except (RuntimeError, OSError) as error:
-            raise UsageError(f"{self.host}:{self.port} cannot be served: {error}") from error
+            text = f"{self.host}:{self.port} cannot be served: {error}; set another host or port"
+            raise UsageError(f"{text}, or end the program that has this one") from error
         address = f"ws://{self.host}:{self._server.port}"
         logger.info("Foxglove: open connection, Foxglove WebSocket, %s", address)
 

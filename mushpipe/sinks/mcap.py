@@ -9,7 +9,7 @@ from itertools import count, takewhile
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from pydantic import ByteSize, Field, PrivateAttr
+from pydantic import ByteSize, Field, PrivateAttr, field_validator
 
 from mushpipe import RunInfo, Sink, SinkPath, Trace
 from mushpipe.core.errors import MushpipeError, UsageError
@@ -55,6 +55,13 @@ class McapSink(Sink):
     _ended: MushpipeError | None = PrivateAttr(None)  # why no further part could be begun
     _unknown: set[type] = PrivateAttr(default_factory=set)
     _base: Transform | None = PrivateAttr(None)
+
+    @field_validator("path")
+    @classmethod
+    def _plays_again(cls, path: Path) -> Path:
+        if path.name.lower().endswith(".bag"):  # by which --source tells Intel's
+            raise ValueError("a recording is MCAP, and .bag one of Intel's viewer: name it .mcap")
+        return path
 
     def files(self, run: RunInfo) -> tuple[Path, ...]:
         """Return the files it writes; of a split recording the first one and all there are."""

@@ -109,6 +109,11 @@ class ImagesSource(ReplaySource):
             return [(path, None) for path in colors.values()]
         depths = _required(self.path, "depth", self.depth)
         colors = {key: path for key, path in colors.items() if path not in depths.values()}
+        if not colors:
+            raise InputError(
+                f"{self.path}: no colour is left: every image named {self.color} (source.color) is "
+                f"a depth image, named {self.depth} (source.depth)"
+            )
         both = colors.keys() & depths.keys()
         if not both:
             raise InputError(

@@ -269,6 +269,14 @@ def test_pictures_and_listings(folder: Path) -> None:
     assert "integer >= 1 <= 255" in described
 
 
+def test_verbs_without_a_log_of_their_own_call_a_warning_one(folder: Path) -> None:
+    graph = folder / "graph.yaml"
+    graph.write_text(GRAPH.partition("sinks:")[0])
+    done = mushpipe("graph", graph, cwd=folder)
+    assert done.stderr == "WARNING: nobody takes what 'pick' produces\n"
+    assert done.returncode == 0
+
+
 def test_the_version_is_that_of_the_installed_package(tmp_path: Path) -> None:
     done = mushpipe("--version", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (0, f"mushpipe {version('mushpipe')}\n")

@@ -122,6 +122,9 @@ def test_without_a_display_it_says_what_to_do(
     assert isinstance(error, DependencyError)
     assert "--save out.rrd" in str(error)
     assert "--serve 9876" in str(error)
+    error = CliRunner().invoke(app, ["view", str(tmp_path / "no.mcap")]).exception
+    assert isinstance(error, UsageError)
+    assert "there is no such recording" in str(error)
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a full device")

@@ -194,7 +194,7 @@ def test_a_file_that_is_no_text(tmp_path):
     path.write_bytes(b"b: 1\na: \xff\xfe")
     with pytest.raises(GraphError, match=r"bad\.yaml:2:4: not UTF-8: the byte 0xff"):
         read_document(path)
-    with pytest.raises(GraphError, match=r"cannot be read: .*Is a directory"):
+    with pytest.raises(GraphError, match=r"cannot be read: Is a directory$"):
         read_document(tmp_path)
 
 

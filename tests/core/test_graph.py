@@ -97,7 +97,7 @@ FAULTS = {
     ),
     "a version that only equals 1": (
         "mushpipe: yes\nsource: {use: frames}\n",
-        """graph.yaml:1:11: mushpipe: Input should be 1, got true
+        """graph.yaml:1:11: mushpipe: expected 1, the version that this program reads, got true
     mushpipe: yes
               ^""",
     ),
@@ -185,9 +185,13 @@ graph.yaml:1:1: setting 'source' is missing
     stages: {}
     ^""",
     ),
+    "the manifest of a run": (
+        "graph_file: demo.yaml\ngraph: {mushpipe: 1}\nversions: {}\n",
+        "graph.yaml: a run's manifest, and no graph: save what stands in it under 'graph'",
+    ),
     "another version": (
         "mushpipe: 2\nsource: {use: frames}\n",
-        """graph.yaml:1:11: mushpipe: Input should be 1, got 2
+        """graph.yaml:1:11: mushpipe: expected 1, the version that this program reads, got 2
     mushpipe: 2
               ^""",
     ),
@@ -390,7 +394,7 @@ def test_a_value_that_a_list_lacks_is_counted(lab: Lab):
     [
         (
             "foo",
-            ["Input should be 'bed' or 'camera', got \"foo\"", "valid array"],
+            ["Input should be 'bed' or 'camera', got \"foo\"", "expected a list in brackets"],
         ),
         ("[1, 2]", ["Input should be 'bed' or 'camera', got [1, 2]", "value 3 is missing"]),
         ("[0, 0, 0]", ["the upright has no direction: a vector needs a component that is not 0"]),

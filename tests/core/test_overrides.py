@@ -198,6 +198,8 @@ def test_source_names_a_recording_or_a_plugin(lab: Lab):
     assert (plan.source.use, str(plan.source.plugin.path)) == ("mcap", "my/bed.mcap")
     assert plan.overrides == ("--source my/bed.mcap",)
     assert lab.compile(GRAPH, source="frames").source.use == "frames"
+    lab.registry.source("realsense", "mushpipe.sources.realsense:RealsenseSource")
+    assert lab.compile(GRAPH, source="my/BED.BAG").source.use == "realsense"
 
 
 def test_a_folder_with_the_name_of_a_source_is_no_recording(lab: Lab, monkeypatch):

@@ -18,6 +18,7 @@ from mushpipe.core.truth import TRUTH_TOPIC, Ignore
 from mushpipe.evaluate.judging import Rules, judge_results
 from mushpipe.evaluate.labels import EXAMPLE, convert, parse_labels
 from mushpipe.evaluate.results import Results, of_picks
+from mushpipe.evaluate.running import recordings_in
 from mushpipe.evaluate.truth import FrameTruth, TruthSet, has_truth, read_truth
 from mushpipe.sources.mcap import McapSource
 from tests.evaluate.scenes import FRAME, bed, header, picks_of, write_recording, write_results
@@ -230,6 +231,8 @@ def test_wrong_labels_are_refused_with_their_place(
 def test_files_that_are_not_there_or_no_json(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no such"):
         read_truth(tmp_path / "none.json")
+    with pytest.raises(UsageError, match="it is a folder"):
+        read_truth(tmp_path)
     (tmp_path / "bad.json").write_text("{")
     with pytest.raises(InputError, match="no labels"):
         read_truth(tmp_path / "bad.json")
@@ -250,6 +253,13 @@ def test_truth_of_a_recording(tmp_path: Path) -> None:
     frame = truth.frames["stamp_ns", header(1).stamp_ns]
     assert frame.frame_id == FRAME
     assert (frame.caps.apex == bed(1).apex).all()
+
+
+@pytest.mark.parametrize("name", ["BED.MCAP", "bed"])
+def test_a_recording_is_none_of_labels_whatever_its_name(tmp_path: Path, name: str) -> None:
+    path = write_recording(tmp_path / name, {0: bed(0)})
+    assert read_truth(path).recording == path
+    assert name == "bed" or recordings_in([tmp_path]) == [path]
 
 
 def test_labels_that_name_no_frame_are_in_that_of_the_camera(tmp_path: Path) -> None:

@@ -176,6 +176,10 @@ def test_numbers_in_names_count_by_their_value(names: list[tuple[str, int]]) -> 
             {"color": "c*.png", "depth": "d/*.png", "depth_scale": 1},
             "no depth image belongs to a colour image: `*` stands for '0' in the first colour",
         ),
+        (
+            {"color": "c*.png", "depth": "c*.png", "depth_scale": 1},
+            "no colour is left: every image named c*.png (source.color) is a depth image, named c*",
+        ),
     ],
 )
 def test_what_is_not_there_is_told_with_what_is(

@@ -270,6 +270,12 @@ def test_the_path_takes_the_name_of_the_recording_and_its_folder_is_made(tmp_pat
     assert set(by_topic(tmp_path / "new" / "bed.out.mcap")) == {COLOR, DEPTH, INFO}
 
 
+def test_a_name_that_would_not_be_played_as_what_it_is_is_refused(tmp_path: Path) -> None:
+    for name in ("row-7.bag", "ROW-7.BAG"):
+        with pytest.raises(ValueError, match=r"name it \.mcap"):
+            McapSink(path=tmp_path / name)
+
+
 def test_a_header_without_arrival_time_is_logged_at_its_stamp(tmp_path: Path) -> None:
     frame = make_frame(header=Header(T0, 0, OPTICAL))
     (row,) = by_topic(record(tmp_path / "out.mcap", [trace_of(frame)]))[COLOR]

@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
@@ -68,6 +69,16 @@ def test_it_tries_again_when_the_server_goes_away(monkeypatch: pytest.MonkeyPatc
         done = robot("client", f"127.0.0.1:{b.port}", "--mode", "stream", "--count", 1, "--raw")
         assert "nobody there; trying again" in done.output
         assert '"op": "targets"' in done.output
+
+
+def test_why_the_server_ended_is_heard_by_who_asks_afterwards() -> None:
+    with bench() as b:
+        client = RobotClient(port=b.port)
+    with client:
+        client.ping()  # is answered by a reset, on which the next line cannot be sent
+        time.sleep(0.1)
+        heard = client.ask("get_targets")
+        assert (heard["op"], heard["reason"]) == ("bye", "end")
 
 
 def test_a_token_and_a_wrong_address(tmp_path: Path) -> None:

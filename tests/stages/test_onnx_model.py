@@ -111,6 +111,8 @@ def test_what_cannot_work_is_said_with_the_file(tmp_path: Path) -> None:
     frame = frame_of(np.zeros((96, 96)), camera=None)
     with pytest.raises(UsageError, match=r"gone\.onnx: there is no such file"):
         Onnx(model=tmp_path / "gone.onnx", output="logits").open()
+    with pytest.raises(UsageError, match="it is a folder"):
+        Onnx(model=tmp_path, output="logits").open()
     text = tmp_path / "text.onnx"
     text.write_text("not a model")
     with pytest.raises(UsageError, match=r"text\.onnx: ONNX Runtime cannot load it"):
