@@ -6,6 +6,8 @@ for it: the nearest goes to the other, and which of those farther up is meant ca
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 from mushpipe.core.document import Document, Location
 from mushpipe.core.errors import MushpipeError, Problem, suggest
 from mushpipe.core.plan import Link, Node
@@ -21,7 +23,7 @@ def wire(document: Document, registry: Registry, nodes: list[Node]) -> list[Prob
     """Fill the links of all nodes, given source first, then stages, then sinks, in file order.
 
     An output that nobody takes becomes a warning of the document, and so do an input that is left
-    open though a stage above takes one of that name, and locations or poses that are of other
+    open though a stage above needs one of that name, and locations or poses that are of other
     circles than those they come together with.
     """
     problems = _check_names(document, nodes)
@@ -178,13 +180,21 @@ def _warn_open(document: Document, nodes: list[Node]) -> None:
         for port in node.ports.inputs:
             key = (port.name, port.type)
             if port.name in node.links:
-                taken[key] = node.name, node.links[port.name].producer
+                if _needs(node, port):
+                    taken[key] = node.name, node.links[port.name].producer
             elif key in taken:
                 other, producer = taken[key]
                 document.warnings.append(
                     f"'{node.name}' goes without '{port.name}', which '{other}' takes from "
                     f"'{producer}': 'inputs: {{{port.name}: {producer}}}' gives it that as well"
                 )
+
+
+def _needs(node: Node, port: Port) -> bool:
+    """Whether a node uses an input, and does not only get it because it is at hand."""
+    with suppress(Exception):  # of a plugin; it is told of where the input is missing
+        return port.required or port.name in {*node.asked, *node.plugin.required_inputs()}
+    return False
 
 
 def _warn_mixed(document: Document, nodes: list[Node]) -> None:

@@ -502,8 +502,13 @@ def test_what_was_found_in_other_circles_is_a_warning(lab: Lab):
     assert len(warnings("both", Locate, Fit, Pick)) == 1  # only the poses are older
 
 
-def test_an_input_left_open_that_a_stage_above_takes_is_a_warning(lab: Lab):
+def test_an_input_left_open_that_a_stage_above_needs_is_a_warning(lab: Lab):
     class Detect(Stage):
+        use_learned: bool = True
+
+        def required_inputs(self) -> frozenset[str]:
+            return frozenset({"learned"} if self.use_learned else ())
+
         def process(self, frame: RgbdFrame, learned: Circles | None = None) -> Circles: ...
 
     class Fit(Stage):
@@ -516,6 +521,11 @@ def test_an_input_left_open_that_a_stage_above_takes_is_a_warning(lab: Lab):
     told = text.replace("{use: fit}", "{use: fit, inputs: {learned: a}}")
     assert lab.compile(told).warnings == ()
     assert lab.compile(lab.chain("both", "fit", "fit")).warnings == ()  # no stage is given any
+
+    class Unlearned(Detect):
+        use_learned: bool = False
+
+    assert lab.compile(lab.chain("both", Unlearned, "fit")).warnings == ()
 
 
 FAULTS = {
