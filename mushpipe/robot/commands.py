@@ -249,7 +249,7 @@ def replay(
     except _NobodyReads as error:
         raise BrokenPipeError from error
     except OSError as error:
-        _note(f"{connect or 'the client'}: {error}")
+        _note(f"{connect or f'127.0.0.1:{listen}'}: {error}")
         raise typer.Exit(1) from None
     if damage:
         raise InputError(
