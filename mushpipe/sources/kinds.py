@@ -26,8 +26,7 @@ def require_kind(name: str, role: Role, first: Raw | None, images: Iterable[Raw]
     Raises:
         InputError: It does.
     """
-    held = _held(first) if first else ""
-    if first is None or held in ("", role):
+    if first is None or (held := _held(first)) in ("", role):
         return
     fit = [raw.channel.topic for raw in images if _held(raw) == role]
     cure = " or ".join(f"--set source.{role}_topic={topic}" for topic in fit)
