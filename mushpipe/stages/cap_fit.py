@@ -143,7 +143,7 @@ class CapFit(Stage):
         seen = None if learned is None else seen_by(learned, circles)
         lone = None if fits is None else lone_chances(circles, fits, seen)
         kin = kin_of(frame.color, circles, lone)
-        chance = chances(circles, unlike(kin), fits, seen)
+        chance = chances(circles, unlike(kin), fits, seen, lone)
         return np.where(clods(frame.color, circles, kin), np.minimum(chance, CLOD_CHANCE), chance)
 
     def _kept(

@@ -120,22 +120,19 @@ def lone_chances(
         learned: (N,) as in `chances`.
         models: Weights, by name, in place of those of the package.
     """
-    table = features(circles, np.full(len(circles), np.nan), fits, learned)
-    return np.where(fits.valid, _lone(table, learned is not None, models), circles.score)
-
-
-def _lone(table: Floats, beside: bool, models: Mapping[str, Floats] | None = None) -> Floats:
-    """Return what the models of lone circles say (N,) of features (N, F): the least of it.
-
-    Of what a network is blind to there, as many are cups and stumps: it has its full say.
-    """
-    weights, known = models or _models(), np.nan_to_num(table)
-    said = [logit(known, weights[name + BESIDE * beside]) for name in LONE]
-    return logistic(np.minimum(*said))
+    table = np.nan_to_num(features(circles, np.full(len(circles), np.nan), fits, learned))
+    # Of what a network is blind to there, as many are cups and stumps: it has its full say.
+    names = [name + BESIDE * (learned is not None) for name in LONE]
+    said = [logit(table, (models or _models())[name]) for name in names]
+    return np.where(fits.valid, logistic(np.minimum(*said)), circles.score)
 
 
 def chances(
-    circles: Circles, unlike: Floats, fits: Fits | None = None, learned: Floats | None = None
+    circles: Circles,
+    unlike: Floats,
+    fits: Fits | None = None,
+    learned: Floats | None = None,
+    lone: Floats | None = None,
 ) -> Floats:
     """Return the probability (N,) of each circle to be a cap.
 
@@ -152,12 +149,13 @@ def chances(
             one: it has models of its own. What it speaks for counts, and, but where few are sure,
             what it speaks against counts half: of real caps it is blind to more than of those that
             it was trained on.
+        lone: (N,) from `lone_chances`, if that is known.
     """
     table = np.nan_to_num(features(circles, unlike, fits, learned))
     model = {name: _said(name, table, learned is not None) for name in ALONE if name not in LONE}
     chance, alike = circles.score, model["seen_kin"]
     if fits is not None:
-        lone = _lone(table, learned is not None)
+        lone = lone_chances(circles, fits, learned) if lone is None else lone
         fitted = np.where(np.isfinite(unlike), model["fitted"], lone)
         chance = np.where(fits.valid, fitted, chance)
         low = flat(fits, circles.score, unlike, learned)
