@@ -22,7 +22,8 @@ def locked(array: Any, dtype: Any) -> NDArray[Any]:
     What it is a view of becomes read-only too, or it could still change. Memory that is not numpy's
     (a camera's buffer, a bytearray) cannot be locked: what can be written there is copied.
     """
-    if isinstance(array, np.ma.MaskedArray) and np.ma.is_masked(array):  # NumPy would take what is behind the mask
+    # NumPy would take what is behind the mask
+    if isinstance(array, np.ma.MaskedArray) and np.ma.is_masked(array):
         numbers = np.dtype(dtype or array.dtype)
         unknown = "NaN: array.filled(np.nan)" if numbers.kind == "f" else "0: array.filled(0)"
         raise ValueError(f"it is a masked array; unknown is {unknown}")
