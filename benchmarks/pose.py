@@ -21,7 +21,7 @@ from pose_scenes import frames, true_circles
 from mushpipe import Camera, Circles, DepthSource
 from mushpipe.core.arrays import Floats
 from mushpipe.core.libraries import import_open3d
-from mushpipe.stages.cap_attempt import ODD
+from mushpipe.stages.cap.attempt import ODD
 from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.depth_correct import DepthCorrect
 from mushpipe.stages.fuse_depth import FuseDepth

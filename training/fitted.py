@@ -21,10 +21,9 @@ from mushpipe import Circles, RgbdFrame
 from mushpipe.core.arrays import Bools, Floats
 from mushpipe.core.truth import Ignore, Truth
 from mushpipe.evaluate.matching import circle_iou
-from mushpipe.stages.cap_batch import Fits
-from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_kin import Kin, sure_of, tones_of, unlike
-from mushpipe.stages.cap_verify import (
+from mushpipe.stages.cap.batch import Fits
+from mushpipe.stages.cap.kin import Kin, sure_of, tones_of, unlike
+from mushpipe.stages.cap.verify import (
     BESIDE,
     FEW,
     FILE,
@@ -37,8 +36,9 @@ from mushpipe.stages.cap_verify import (
     flat,
     lone_chances,
 )
+from mushpipe.stages.cap_fit import CapFit
+from mushpipe.stages.phase.learned import seen_by
 from mushpipe.stages.phase_hough import PhaseHough
-from mushpipe.stages.phase_learned import seen_by
 from mushpipe.stages.verifier import LIMIT, weights_of
 from training.harder import harder
 from training.logistic import fit, write

@@ -1,1 +1,1 @@
-"""The built-in stages, one module each, numeric kernels beside them."""
+"""The built-in stages, one module each, numeric kernels beside them or in `cap` and `phase`."""

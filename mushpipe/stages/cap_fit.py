@@ -20,19 +20,19 @@ from mushpipe import (
 from mushpipe.core.arrays import Bytes, Floats, Rows, Singles
 from mushpipe.core.geometry import lengths
 from mushpipe.stages.calibrated import calibration_of
-from mushpipe.stages.cap_attempt import Frame, Settings
-from mushpipe.stages.cap_batch import LEVER, Fits, fit_caps
-from mushpipe.stages.cap_blocks import Image, Sensor
-from mushpipe.stages.cap_clod import CLOD_CHANCE, clods
+from mushpipe.stages.cap.attempt import Frame, Settings
+from mushpipe.stages.cap.batch import LEVER, Fits, fit_caps
+from mushpipe.stages.cap.blocks import Image, Sensor
+from mushpipe.stages.cap.clod import CLOD_CHANCE, clods
+from mushpipe.stages.cap.gap import EdgeWatch
+from mushpipe.stages.cap.kin import FEWEST, kin_of, unlike
+from mushpipe.stages.cap.model import ASPECT, ASPECT_SIGMA
+from mushpipe.stages.cap.order import Order, by_depth
+from mushpipe.stages.cap.solve import Habit, Noise
+from mushpipe.stages.cap.verify import chances, lone_chances
 from mushpipe.stages.cap_decode import first_of_each
-from mushpipe.stages.cap_gap import EdgeWatch
-from mushpipe.stages.cap_kin import FEWEST, kin_of, unlike
-from mushpipe.stages.cap_model import ASPECT, ASPECT_SIGMA
-from mushpipe.stages.cap_order import Order, by_depth
-from mushpipe.stages.cap_solve import Habit, Noise
-from mushpipe.stages.cap_verify import chances, lone_chances
 from mushpipe.stages.discs import discs_of
-from mushpipe.stages.phase_learned import seen_by
+from mushpipe.stages.phase.learned import seen_by
 from mushpipe.stages.surface_fit import fit_tops, sources, variance_along, without_tip
 from mushpipe.stages.upright import Up, pixel_rays, upright
 from mushpipe.stages.warm_up import example_circles, example_frame

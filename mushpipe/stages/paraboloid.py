@@ -6,7 +6,7 @@ import numpy as np
 
 from mushpipe.core.arrays import Floats, Ints, Rows
 from mushpipe.core.jit import borrower, jit
-from mushpipe.stages.cap_blocks import (
+from mushpipe.stages.cap.blocks import (
     CELLS,
     DEPTH,
     SPREAD,
@@ -22,8 +22,8 @@ from mushpipe.stages.cap_blocks import (
     own_depth,
     room_to_cut,
 )
-from mushpipe.stages.cap_model import ASPECT
-from mushpipe.stages.cap_samples import ray_at
+from mushpipe.stages.cap.model import ASPECT
+from mushpipe.stages.cap.samples import ray_at
 
 COEFFICIENTS = 7
 TIP = 6  # the coefficient that says how pointed a cap is

@@ -14,14 +14,14 @@ from mushpipe.core.arrays import Bools, Bytes, Floats, Ints32, Singles
 from mushpipe.core.paths import GraphPath
 from mushpipe.stages.discs import LIKELY, Radii, discs_of, many_likely
 from mushpipe.stages.doubling import doubled
-from mushpipe.stages.phase_blobs import blobs_of
-from mushpipe.stages.phase_decide import decide
-from mushpipe.stages.phase_depth import NO_RELIEF, Relief, relief_of
-from mushpipe.stages.phase_doubt import Contradiction
-from mushpipe.stages.phase_edges import Gradient, edges_of, gradient_of, otsu_of
-from mushpipe.stages.phase_features import AT_LEARNED, static_features
-from mushpipe.stages.phase_fuse import fused
-from mushpipe.stages.phase_learned import (
+from mushpipe.stages.phase.blobs import blobs_of
+from mushpipe.stages.phase.decide import decide
+from mushpipe.stages.phase.depth import NO_RELIEF, Relief, relief_of
+from mushpipe.stages.phase.doubt import Contradiction
+from mushpipe.stages.phase.edges import Gradient, edges_of, gradient_of, otsu_of
+from mushpipe.stages.phase.features import AT_LEARNED, static_features
+from mushpipe.stages.phase.fuse import fused
+from mushpipe.stages.phase.learned import (
     add_discs,
     agreement,
     candidates_of,
@@ -31,11 +31,11 @@ from mushpipe.stages.phase_learned import (
     with_bare,
     without_clods,
 )
-from mushpipe.stages.phase_polish import polish
-from mushpipe.stages.phase_refit import refit
-from mushpipe.stages.phase_strips import Strips, in_strips
-from mushpipe.stages.phase_verifier import load_verifier
-from mushpipe.stages.phase_votes import CELL, centres
+from mushpipe.stages.phase.polish import polish
+from mushpipe.stages.phase.refit import refit
+from mushpipe.stages.phase.strips import Strips, in_strips
+from mushpipe.stages.phase.verifier import load_verifier
+from mushpipe.stages.phase.votes import CELL, centres
 from mushpipe.stages.verifier_net import Models
 from mushpipe.stages.warm_up import example_circles, example_frame
 

@@ -10,10 +10,10 @@ from mushpipe.core.arrays import Bytes, Floats, Ints, Rows, Singles
 from mushpipe.core.geometry import lengths
 from mushpipe.core.jit import borrower
 from mushpipe.stages.calibrated import calibration_of
-from mushpipe.stages.cap_blocks import CELLS, Image
-from mushpipe.stages.cap_model import ASPECT, ASPECT_SIGMA, LIP
-from mushpipe.stages.cap_order import Order, by_depth
-from mushpipe.stages.cap_samples import ASTRAY
+from mushpipe.stages.cap.blocks import CELLS, Image
+from mushpipe.stages.cap.model import ASPECT, ASPECT_SIGMA, LIP
+from mushpipe.stages.cap.order import Order, by_depth
+from mushpipe.stages.cap.samples import ASTRAY
 from mushpipe.stages.discs import discs_of, radii_on_rays
 from mushpipe.stages.paraboloid import COEFFICIENTS, SHAPE_M, TIP, fit_surfaces
 from mushpipe.stages.upright import pixel_rays

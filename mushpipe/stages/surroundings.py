@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from mushpipe.core.arrays import Floats, Ints
 from mushpipe.core.jit import jit
 from mushpipe.core.tables import Circles, Locations
-from mushpipe.stages.cap_order import paint
+from mushpipe.stages.cap.order import paint
 from mushpipe.stages.discs import discs_of
 from mushpipe.stages.pairs import distances
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mushpipe import Camera, Circles, Header, RgbdFrame
-from mushpipe.stages.cap_blocks import Image
+from mushpipe.stages.cap.blocks import Image
 from mushpipe.stages.upright import pixel_rays
 
 CAMERA = Camera(320, 240, 400.0, 400.0, 159.5, 119.5)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mushpipe.stages.cap_blocks import (
+from mushpipe.stages.cap.blocks import (
     CELLS,
     COUNT,
     DEPTH,
@@ -22,7 +22,7 @@ from mushpipe.stages.cap_blocks import (
     own_depth,
     room_to_cut,
 )
-from mushpipe.stages.cap_samples import COMPASS, DIRECTIONS, INNER, RADII, STEP, follow
+from mushpipe.stages.cap.samples import COMPASS, DIRECTIONS, INNER, RADII, STEP, follow
 
 WIDTH, HEIGHT = 64, 48
 PLACES = st.tuples(st.floats(-10, 74), st.floats(-10, 58), st.floats(4, 30))

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mushpipe import Camera, Circles
-from mushpipe.stages.cap_circle import circle_around, improve
+from mushpipe.stages.cap.circle import circle_around, improve
+from mushpipe.stages.cap.model import SIZE, span
+from mushpipe.stages.cap.outline import LANES_ROOM
+from mushpipe.stages.cap.samples import COMPASS, DIRECTIONS
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_model import SIZE, span
-from mushpipe.stages.cap_outline import LANES_ROOM
-from mushpipe.stages.cap_samples import COMPASS, DIRECTIONS
 from tests.stages.caps import CAMERA, Cap, cap, circle_of, circles_of, draw, frame_from, image_of
 
 ROOM = (np.empty(LANES_ROOM, np.float32), np.empty(2 * DIRECTIONS, np.int32))

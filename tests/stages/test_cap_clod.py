@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from mushpipe import Circles, RgbdFrame
 from mushpipe.core.types import Header
-from mushpipe.stages.cap_clod import CLOD_CHANCE
-from mushpipe.stages.cap_clod import clods as clods_of
+from mushpipe.stages.cap.clod import CLOD_CHANCE
+from mushpipe.stages.cap.clod import clods as clods_of
+from mushpipe.stages.cap.kin import FEWEST, kin_of
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_kin import FEWEST, kin_of
 from mushpipe.stages.discs import LIKELY
 
 HEIGHT, WIDTH, RADIUS = 240, 320, 9.0

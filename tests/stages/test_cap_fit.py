@@ -8,8 +8,8 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
 from mushpipe import Camera, Circles, DepthSource, Locations, Poses
+from mushpipe.stages.cap.model import ROOM, SIZE, fill_rows, move, span
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_model import ROOM, SIZE, fill_rows, move, span
 from mushpipe.stages.upright import pixel_rays, upright
 from tests.stages.caps import (
     CAMERA,

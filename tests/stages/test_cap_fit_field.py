@@ -8,7 +8,7 @@ import orjson
 import pytest
 
 from mushpipe import Circles, RgbdFrame
-from mushpipe.stages.cap_batch import Fits
+from mushpipe.stages.cap.batch import Fits
 from mushpipe.stages.cap_fit import CapFit
 from tests.stages.frames import field_data, recorded
 

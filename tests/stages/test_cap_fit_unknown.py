@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mushpipe import Camera, Circles, DepthSource, Header, InputError, RgbdFrame
+from mushpipe.stages.cap.regrow import beyond
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_regrow import beyond
 from tests.stages.caps import (
     CAMERA,
     angle,

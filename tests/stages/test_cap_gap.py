@@ -13,8 +13,8 @@ import pytest
 from mushpipe import Camera, Circles, Header, Mask, RgbdFrame
 from mushpipe.evaluate.truth import read_truth
 from mushpipe.sources.mcap import McapSource
+from mushpipe.stages.cap.gap import EdgeWatch, edge_gaps, usual
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_gap import EdgeWatch, edge_gaps, usual
 from mushpipe.stages.phase_hough import PhaseHough
 from tests.stages.frames import SIMULATED
 

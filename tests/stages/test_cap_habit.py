@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mushpipe.stages.cap.habit import HELD, SCENES, usual_aspect
+from mushpipe.stages.cap.linear import cholesky
+from mushpipe.stages.cap.model import UNKNOWNS
+from mushpipe.stages.cap.solve import variance_of_aspect
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_habit import HELD, SCENES, usual_aspect
-from mushpipe.stages.cap_linear import cholesky
-from mushpipe.stages.cap_model import UNKNOWNS
-from mushpipe.stages.cap_solve import variance_of_aspect
 from tests.stages.caps import angle, cap, circles_of, draw, frame_from
 
 USUAL, SIGMA = 0.62, 0.2

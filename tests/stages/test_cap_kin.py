@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from mushpipe import Circles, RgbdFrame
 from mushpipe.core.types import Header
+from mushpipe.stages.cap.kin import DARK, FEWEST, MOST, SURE, USUAL, kin_of, sure_of, unlike
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_kin import DARK, FEWEST, MOST, SURE, USUAL, kin_of, sure_of, unlike
 
 HEIGHT, WIDTH, RADIUS = 240, 320, 9.0
 CAP, CLOD, SOIL = np.array([190.0, 180, 165]), np.array([60.0, 45, 35]), np.array([40.0, 30, 25])

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mushpipe.stages.cap_order import by_depth, paint
+from mushpipe.stages.cap.order import by_depth, paint
 
 HEIGHT, WIDTH = 40, 60
 PLACES = st.floats(-80, 120) | st.sampled_from([-1e9, -34980.0, 35020.0, 1e9])

@@ -6,12 +6,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mushpipe import Circles
-from mushpipe.stages.cap_blocks import Image
+from mushpipe.stages.cap.blocks import Image
+from mushpipe.stages.cap.linear import solve3
+from mushpipe.stages.cap.model import SIZE, span
+from mushpipe.stages.cap.regrow import denials, regrow
+from mushpipe.stages.cap.samples import DIRECTIONS
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_linear import solve3
-from mushpipe.stages.cap_model import SIZE, span
-from mushpipe.stages.cap_regrow import denials, regrow
-from mushpipe.stages.cap_samples import DIRECTIONS
 from tests.stages.caps import cap, circles_of, draw, frame_from, image_of
 
 BED = 0.44

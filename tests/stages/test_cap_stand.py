@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mushpipe.stages.cap_blocks import Image
+from mushpipe.stages.cap.blocks import Image
+from mushpipe.stages.cap.order import by_depth
+from mushpipe.stages.cap.stand import stands
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_order import by_depth
-from mushpipe.stages.cap_stand import stands
 from mushpipe.stages.upright import pixel_rays
 from tests.stages.caps import CAMERA, cap, circles_of, draw, frame_from
 

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mushpipe.stages.cap.model import BULGE, HEIGHT, RADIUS, ROOM, SIZE, N
+from mushpipe.stages.cap.solve import ROUND
+from mushpipe.stages.cap.top import BENT, SUNK, rise
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_model import BULGE, HEIGHT, RADIUS, ROOM, SIZE, N
-from mushpipe.stages.cap_solve import ROUND
-from mushpipe.stages.cap_top import BENT, SUNK, rise
 from tests.stages.caps import CAMERA, cap, circles_of, draw, frame_from, frame_of
 
 R, H = 0.02, 0.4

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mushpipe import Circles, DepthSource, RgbdFrame
+from mushpipe.stages.cap.verify import FILE, FLAT_CHANCE, NAMES, chances, features
 from mushpipe.stages.cap_fit import CapFit
-from mushpipe.stages.cap_verify import FILE, FLAT_CHANCE, NAMES, chances, features
 from mushpipe.stages.verifier import LIMIT, logistic, logit, package_file, read_models
 from tests.stages.caps import CAMERA, cap, circles_of, draw, frame_from
 

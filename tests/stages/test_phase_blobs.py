@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.cap_net import CapNet
 from mushpipe.stages.discs import Radii
-from mushpipe.stages.phase_blobs import LEVELS, blobs_of
-from mushpipe.stages.phase_depth import NO_RELIEF, Relief
+from mushpipe.stages.phase.blobs import LEVELS, blobs_of
+from mushpipe.stages.phase.depth import NO_RELIEF, Relief
 from mushpipe.stages.phase_hough import PhaseHough
 from tests.stages.frames import field_data, recorded
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mushpipe.stages.phase_depth import NO_RELIEF, halved
+from mushpipe.stages.phase.depth import NO_RELIEF, halved
 from mushpipe.stages.phase_hough import _foreground
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from mushpipe.stages.phase_edges import edges_of, gradient_of
+from mushpipe.stages.phase.edges import edges_of, gradient_of
 from tests.stages.scenes import discs
 
 

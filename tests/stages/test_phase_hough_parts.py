@@ -8,22 +8,22 @@ import pytest
 from mushpipe import Mask
 from mushpipe.stages.bed import far_cells, fit_plane, plane_depth
 from mushpipe.stages.discs import Radii, lens
-from mushpipe.stages.phase_decide import decide, outline_features, overlap_features
-from mushpipe.stages.phase_depth import GRID, NO_RELIEF, closed, halved, relief_of
-from mushpipe.stages.phase_edges import edges_of, gradient_of, otsu_of
-from mushpipe.stages.phase_features import (
+from mushpipe.stages.phase.decide import decide, outline_features, overlap_features
+from mushpipe.stages.phase.depth import GRID, NO_RELIEF, closed, halved, relief_of
+from mushpipe.stages.phase.edges import edges_of, gradient_of, otsu_of
+from mushpipe.stages.phase.features import (
     DEPTH_FEATURES,
     IMAGE_FEATURES,
     LEARNED,
     NAMES,
     static_features,
 )
+from mushpipe.stages.phase.refit import DIRECTIONS, HIDDEN, directions_of
+from mushpipe.stages.phase.scratch import scratch_for
+from mushpipe.stages.phase.strips import Strips, in_strips
+from mushpipe.stages.phase.verifier import load_verifier
+from mushpipe.stages.phase.votes import GAP, peaks, phase_of, rings_between, summed, vote
 from mushpipe.stages.phase_hough import PhaseHough, equal_area_radius
-from mushpipe.stages.phase_refit import DIRECTIONS, HIDDEN, directions_of
-from mushpipe.stages.phase_scratch import scratch_for
-from mushpipe.stages.phase_strips import Strips, in_strips
-from mushpipe.stages.phase_verifier import load_verifier
-from mushpipe.stages.phase_votes import GAP, peaks, phase_of, rings_between, summed, vote
 from mushpipe.stages.verifier_net import Models
 from tests.stages.scenes import discs, frame_of, sphere_depth
 

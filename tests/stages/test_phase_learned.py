@@ -6,8 +6,7 @@ import pytest
 from mushpipe import Circles, Mask, UsageError
 from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.discs import LIKELY, Radii
-from mushpipe.stages.phase_hough import PhaseHough
-from mushpipe.stages.phase_learned import (
+from mushpipe.stages.phase.learned import (
     add_discs,
     agreement,
     candidates_of,
@@ -15,6 +14,7 @@ from mushpipe.stages.phase_learned import (
     with_bare,
     without_clods,
 )
+from mushpipe.stages.phase_hough import PhaseHough
 from tests.stages.caps import cap, draw, frame_from
 from tests.stages.scenes import discs, frame_of
 

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from mushpipe.stages.phase_edges import Edges
-from mushpipe.stages.phase_scratch import scratch_for
-from mushpipe.stages.phase_strips import (
+from mushpipe.stages.phase.edges import Edges
+from mushpipe.stages.phase.scratch import scratch_for
+from mushpipe.stages.phase.strips import (
     ALIGNED,
     RAY,
     TURNED,

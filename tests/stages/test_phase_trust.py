@@ -7,11 +7,11 @@ from hypothesis import strategies as st
 
 from mushpipe import Mask
 from mushpipe.core.arrays import Floats
-from mushpipe.stages.phase_decide import decide, neighbours
-from mushpipe.stages.phase_features import LEARNED, NAMES
+from mushpipe.stages.phase.decide import decide, neighbours
+from mushpipe.stages.phase.features import LEARNED, NAMES
+from mushpipe.stages.phase.trust import mixed, trust_in
+from mushpipe.stages.phase.verifier import load_verifier
 from mushpipe.stages.phase_hough import PhaseHough
-from mushpipe.stages.phase_trust import mixed, trust_in
-from mushpipe.stages.phase_verifier import load_verifier
 from mushpipe.stages.verifier_net import Models
 from tests.stages.scenes import discs, frame_of
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mushpipe.core.errors import UsageError
-from mushpipe.stages.phase_verifier import load_verifier
+from mushpipe.stages.phase.verifier import load_verifier
 from mushpipe.stages.verifier_net import (
     LIMIT,
     WIDTHS,

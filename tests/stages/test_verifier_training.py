@@ -9,7 +9,7 @@ import pytest
 
 from mushpipe import Circles
 from mushpipe.core.truth import INSTANCES_TOPIC, TRUTH_TOPIC, Ignore
-from mushpipe.stages.cap_verify import BESIDE, MODELS, NAMES
+from mushpipe.stages.cap.verify import BESIDE, MODELS, NAMES
 from mushpipe.stages.verifier_net import LIMIT, WIDTHS, probability, read_models, write_models
 from tests.stages.frames import simulated
 from training.fitted import labels, teaches

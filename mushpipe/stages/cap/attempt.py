@@ -12,11 +12,11 @@ import numpy as np
 
 from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.jit import borrower, jit
-from mushpipe.stages.cap_blocks import Cut, Image, Sensor, own_depth, room_to_cut
-from mushpipe.stages.cap_model import HEIGHT, ROOM, SIZE
-from mushpipe.stages.cap_outline import LANES_ROOM, Lanes, expected_reach, sample_outline
-from mushpipe.stages.cap_regrow import denials, regrow, slack
-from mushpipe.stages.cap_samples import (
+from mushpipe.stages.cap.blocks import Cut, Image, Sensor, own_depth, room_to_cut
+from mushpipe.stages.cap.model import HEIGHT, ROOM, SIZE
+from mushpipe.stages.cap.outline import LANES_ROOM, Lanes, expected_reach, sample_outline
+from mushpipe.stages.cap.regrow import denials, regrow, slack
+from mushpipe.stages.cap.samples import (
     ASTRAY,
     COMPASS,
     DIRECTIONS,
@@ -28,7 +28,7 @@ from mushpipe.stages.cap_samples import (
     sample_edges,
     touch,
 )
-from mushpipe.stages.cap_solve import (
+from mushpipe.stages.cap.solve import (
     ROUND,
     STAGES,
     Habit,
@@ -39,7 +39,7 @@ from mushpipe.stages.cap_solve import (
     variance_of_tilt,
     workspace,
 )
-from mushpipe.stages.cap_start import CONICAL, USUAL, axis_of, start
+from mushpipe.stages.cap.start import CONICAL, USUAL, axis_of, start
 
 POOR = 0.9  # misfit (a usual cap has 0.25) at which a fit starts again; it widens the sigmas, too
 BETTER = 0.8  # how much smaller the misfit of another start must be

@@ -12,11 +12,11 @@ import numpy as np
 
 from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.jit import borrower
-from mushpipe.stages.cap_blocks import Image
-from mushpipe.stages.cap_model import Vector
-from mushpipe.stages.cap_outline import Lanes, expected_reach
-from mushpipe.stages.cap_regrow import beyond
-from mushpipe.stages.cap_samples import COMPASS, DIRECTIONS
+from mushpipe.stages.cap.blocks import Image
+from mushpipe.stages.cap.model import Vector
+from mushpipe.stages.cap.outline import Lanes, expected_reach
+from mushpipe.stages.cap.regrow import beyond
+from mushpipe.stages.cap.samples import COMPASS, DIRECTIONS
 
 CLEAR = 0.8  # weight of a detected circle whose outline the image shows all around
 APART = 0.15  # distance of the two centres, in radii, at which that weight is halved

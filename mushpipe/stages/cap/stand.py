@@ -10,7 +10,7 @@ import numpy as np
 
 from mushpipe.core.arrays import Floats
 from mushpipe.core.jit import jit
-from mushpipe.stages.cap_blocks import Image, median
+from mushpipe.stages.cap.blocks import Image, median
 
 # The ground is looked at from 1.3 to 1.9 radii away.
 _TURNS = 2 * np.pi * (np.arange(24) + 0.5) / 24

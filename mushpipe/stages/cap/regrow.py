@@ -6,10 +6,10 @@ import numpy as np
 
 from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.jit import borrower, jit
-from mushpipe.stages.cap_blocks import Image
-from mushpipe.stages.cap_linear import tukey
-from mushpipe.stages.cap_model import HEIGHT, RADIUS, N
-from mushpipe.stages.cap_samples import COMPASS, DIRECTIONS
+from mushpipe.stages.cap.blocks import Image
+from mushpipe.stages.cap.linear import tukey
+from mushpipe.stages.cap.model import HEIGHT, RADIUS, N
+from mushpipe.stages.cap.samples import COMPASS, DIRECTIONS
 from mushpipe.stages.linear import solve
 
 FROM, TO = 0.3, 2.2  # in radii of the circle: where the surface in it may end

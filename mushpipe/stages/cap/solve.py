@@ -8,14 +8,14 @@ import numpy as np
 
 from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.jit import borrower, jit
-from mushpipe.stages.cap_linear import (
+from mushpipe.stages.cap.linear import (
     cholesky,
     invert_factor,
     multiply,
     substitute,
     tukey,
 )
-from mushpipe.stages.cap_model import (
+from mushpipe.stages.cap.model import (
     BULGE,
     E1,
     E2,

@@ -9,8 +9,8 @@ import numpy as np
 from mushpipe import Circles
 from mushpipe.core.arrays import Bools, Bytes, Floats, Ints32, Singles
 from mushpipe.core.jit import borrower, jit
-from mushpipe.stages.cap_clod import ODD, darker, ground_of, off_ground
-from mushpipe.stages.cap_kin import FEWEST, SURE, alike, tones_of
+from mushpipe.stages.cap.clod import ODD, darker, ground_of, off_ground
+from mushpipe.stages.cap.kin import FEWEST, SURE, alike, tones_of
 from mushpipe.stages.discs import (
     LEAST_OF_RANGE,
     MOST_OF_RANGE,

@@ -1,7 +1,7 @@
 """What speaks for and against a candidate: named features, each with one definition.
 
 Features of the image, then features that need depth. `free`, `support`, `trust`, `hits`, `overlap`,
-`spans` and `doubled` depend on what has been accepted before and stand in `phase_decide`.
+`spans` and `doubled` depend on what has been accepted before and stand in `phase.decide`.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import numpy as np
 from mushpipe.core.arrays import Bytes, Floats, Ints32, Singles
 from mushpipe.core.jit import borrower
 from mushpipe.stages.linear import solve
-from mushpipe.stages.phase_depth import Relief
-from mushpipe.stages.phase_edges import Gradient
-from mushpipe.stages.phase_refit import COSINES, HIDDEN, SINES
-from mushpipe.stages.phase_scratch import DIRECTIONS
-from mushpipe.stages.phase_steps import height_at, rises, step_up
+from mushpipe.stages.phase.depth import Relief
+from mushpipe.stages.phase.edges import Gradient
+from mushpipe.stages.phase.refit import COSINES, HIDDEN, SINES
+from mushpipe.stages.phase.scratch import DIRECTIONS
+from mushpipe.stages.phase.steps import height_at, rises, step_up
 
 # How bright a cap is against what is beside it is none of them: simulated beds are fuller than real
 # ones, so a cap with dark soil all around it counted as less likely than one in a cluster.
@@ -45,7 +45,7 @@ DEPTH_FEATURES = {
     "rise": "share of the known outline outside which it is higher by a step",
     "gap": "share of the disc without depth",
 }
-LEARNED = "learned"  # what circles of another detector say; see `phase_learned`
+LEARNED = "learned"  # what circles of another detector say; see `phase.learned`
 NAMES = (*IMAGE_FEATURES, *DEPTH_FEATURES, LEARNED)
 AT_LEARNED = NAMES.index(LEARNED)
 FIRST_STATIC = NAMES.index("residual")

@@ -16,8 +16,8 @@ import numpy as np
 from mushpipe.core.arrays import Singles
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.discs import LEAST_OF_RANGE, MOST_OF_RANGE, Radii
-from mushpipe.stages.phase_depth import CELL, Relief
-from mushpipe.stages.phase_votes import highest_around
+from mushpipe.stages.phase.depth import CELL, Relief
+from mushpipe.stages.phase.votes import highest_around
 
 LEVELS = (0.01, 0.014, 0.02, 0.028, 0.035, 0.05)  # m over the bed
 STEP = 2  # px of the height map; a start for a refit need not be more exact

@@ -21,7 +21,7 @@ import numpy as np
 from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.discs import Radii
-from mushpipe.stages.phase_strips import Strips
+from mushpipe.stages.phase.strips import Strips
 
 CELL = 2  # px; the accumulator has half the resolution of the image
 GAP = 0.15

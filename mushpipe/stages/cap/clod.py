@@ -1,7 +1,7 @@
 """What looks as the ground around it does, and not as most caps in view do, is a clod.
 
 A round clod may have the form of a cap, in the image and in depth, and a network that never saw
-such soil may be sure of it; several of them are then kin (`cap_kin`). But brown caps on brown soil
+such soil may be sure of it; several of them are then kin (`cap.kin`). But brown caps on brown soil
 look like each other, and white ones on mycelium do.
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 from mushpipe import Circles
 from mushpipe.core.arrays import Bools, Bytes, Floats, Ints, locked
 from mushpipe.core.jit import borrower
-from mushpipe.stages.cap_kin import DARK, UNIT, Kin, alike, write_tone
+from mushpipe.stages.cap.kin import DARK, UNIT, Kin, alike, write_tone
 from mushpipe.stages.discs import LIKELY, discs_of
 
 ODD = 1.5  # distance to the nearer half of the sure caps from which on it is none of them
@@ -60,7 +60,7 @@ def ground_of(color: Bytes, circles: Circles, asked: Bools) -> Floats:
         asked: (N,) of which circles.
 
     Returns:
-        (N, 7) tone, as by `cap_kin.tones_of`; standard deviation of the brightness over its mean;
+        (N, 7) tone, as by `cap.kin.tones_of`; standard deviation of the brightness over its mean;
         tone of the soil (`SOIL`), which is the darkest of it. NaN where it is not asked for, no
         ground is seen, or it is too dark to tell.
     """

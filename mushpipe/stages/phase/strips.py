@@ -13,9 +13,9 @@ import numpy as np
 
 from mushpipe.core.arrays import Floats, Ints32, Singles
 from mushpipe.core.jit import borrower, inlined, jit
-from mushpipe.stages.phase_edges import Edges
-from mushpipe.stages.phase_scratch import Scratch
-from mushpipe.stages.phase_steps import rises
+from mushpipe.stages.phase.edges import Edges
+from mushpipe.stages.phase.scratch import Scratch
+from mushpipe.stages.phase.steps import rises
 
 Single = np.float32
 STRIP = 16  # px

@@ -15,7 +15,7 @@ import numpy as np
 
 from mushpipe import Circles
 from mushpipe.core.arrays import Bools, Floats
-from mushpipe.stages.cap_batch import Fits
+from mushpipe.stages.cap.batch import Fits
 from mushpipe.stages.verifier import logistic, logit, package_file, read_models
 
 FILE = "fitted.yaml"
@@ -56,7 +56,7 @@ def features(
     on the sensor; log of the sigma of the tilt, rad; height over radius, up to `ROUND`; how far the
     fit moves the circle, in its radii; log of how much larger or smaller it makes it; how far the
     axis leans off the upright, rad; how far the apex stands above the ground, in radii, up to
-    `STANDS`, and that where no ground is seen; how unlike the sure caps it is (`cap_kin`); logit of
+    `STANDS`, and that where no ground is seen; how unlike the sure caps it is (`cap.kin`); logit of
     how far it is a circle of the network.
     """
     table = np.full((len(circles), len(NAMES)), np.nan)
@@ -145,7 +145,7 @@ def chances(
         circles: As detected, with the scores of `phase-hough`.
         unlike: (N,) how unlike the sure caps they are, NaN where that is not known.
         fits: Of these circles, if there is depth.
-        learned: (N,) how far each is a circle of a network (`phase_learned.agreement`), if there is
+        learned: (N,) how far each is a circle of a network (`phase.learned.agreement`), if there is
             one: it has models of its own. What it speaks for counts, and, but where few are sure,
             what it speaks against counts half: of real caps it is blind to more than of those that
             it was trained on.

@@ -16,10 +16,10 @@ from mushpipe.core.arrays import Floats, Ints32, Singles
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.discs import Radii, within
 from mushpipe.stages.linear import solve
-from mushpipe.stages.phase_depth import Relief
-from mushpipe.stages.phase_scratch import DIRECTIONS, Scratch, scratch_for
-from mushpipe.stages.phase_steps import step_up
-from mushpipe.stages.phase_strips import TURNED, Strips, gather, outline_hits
+from mushpipe.stages.phase.depth import Relief
+from mushpipe.stages.phase.scratch import DIRECTIONS, Scratch, scratch_for
+from mushpipe.stages.phase.steps import step_up
+from mushpipe.stages.phase.strips import TURNED, Strips, gather, outline_hits
 
 # Cosine and sine of each direction, by how many directions there are.
 _TURNS = 2 * np.pi * np.arange(DIRECTIONS) / np.maximum(np.arange(DIRECTIONS + 1), 1)[:, None]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mushpipe.core.arrays import Floats, Ints32, Singles
 from mushpipe.core.jit import borrower, inlined, jit
-from mushpipe.stages.cap_model import Single
+from mushpipe.stages.cap.model import Single
 
 GRID = 11
 HIDDEN = Single(-1)

@@ -8,7 +8,7 @@ import numpy as np
 
 from mushpipe.core.arrays import Bools, Floats, Ints
 from mushpipe.core.jit import borrower, jit
-from mushpipe.stages.cap_attempt import (
+from mushpipe.stages.cap.attempt import (
     COUNTS,
     DOME,
     EDGES,
@@ -27,11 +27,11 @@ from mushpipe.stages.cap_attempt import (
     fit_cap,
     scratch,
 )
-from mushpipe.stages.cap_blocks import CELLS
-from mushpipe.stages.cap_circle import improve
-from mushpipe.stages.cap_habit import spread_of, usual_aspect
-from mushpipe.stages.cap_linear import invert
-from mushpipe.stages.cap_model import (
+from mushpipe.stages.cap.blocks import CELLS
+from mushpipe.stages.cap.circle import improve
+from mushpipe.stages.cap.habit import spread_of, usual_aspect
+from mushpipe.stages.cap.linear import invert
+from mushpipe.stages.cap.model import (
     HEIGHT,
     RADIUS,
     ROOM,
@@ -45,11 +45,11 @@ from mushpipe.stages.cap_model import (
     meet,
     slope,
 )
-from mushpipe.stages.cap_regrow import beyond, slack
-from mushpipe.stages.cap_samples import ASTRAY, DIRECTIONS, ray_at
-from mushpipe.stages.cap_solve import ROUND, STAGES, Habit, refine, tilt
-from mushpipe.stages.cap_stand import stands
-from mushpipe.stages.cap_top import rise
+from mushpipe.stages.cap.regrow import beyond, slack
+from mushpipe.stages.cap.samples import ASTRAY, DIRECTIONS, ray_at
+from mushpipe.stages.cap.solve import ROUND, STAGES, Habit, refine, tilt
+from mushpipe.stages.cap.stand import stands
+from mushpipe.stages.cap.top import rise
 
 ROUNDNESS = 0.01  # in rim radii: how far the rim of a cap is from the circle of its area
 GUESSED = 0.1  # in rim radii: how far off an outline is that no depth edge confirms,

@@ -12,7 +12,7 @@ import math
 
 from mushpipe.core.arrays import Floats, Ints32
 from mushpipe.core.jit import borrower
-from mushpipe.stages.cap_kin import FEWEST
+from mushpipe.stages.cap.kin import FEWEST
 
 SURE = 0.95  # probability without the network from which on a candidate tells
 SEEN = 0.5  # agreement from which on the network sees it
@@ -31,7 +31,7 @@ def trust_in(
         shapes: (N, 5) outlines of candidates.
         alone: (N,) probability without the network, 0 of those that do not tell.
         agreement: (N,) of them with the network.
-        first: (N + 1,) as from `phase_decide.neighbours`.
+        first: (N + 1,) as from `phase.decide.neighbours`.
         beside: (M,) as well.
     """
     seen = sure = 0

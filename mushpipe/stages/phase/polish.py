@@ -9,11 +9,11 @@ import numpy as np
 from mushpipe.core.arrays import Floats, Ints32, Singles
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.discs import Radii, within
-from mushpipe.stages.phase_decide import covered
-from mushpipe.stages.phase_depth import Relief
-from mushpipe.stages.phase_refit import NARROW, around, fit_outline
-from mushpipe.stages.phase_scratch import Scratch, scratch_for
-from mushpipe.stages.phase_strips import Strips
+from mushpipe.stages.phase.decide import covered
+from mushpipe.stages.phase.depth import Relief
+from mushpipe.stages.phase.refit import NARROW, around, fit_outline
+from mushpipe.stages.phase.scratch import Scratch, scratch_for
+from mushpipe.stages.phase.strips import Strips
 
 SHADE = 3.0  # px; so far around an accepted circle, a lower one is shaded
 OWN = 24  # edge points with which an outline is fitted to what is its own

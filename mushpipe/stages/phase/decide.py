@@ -17,11 +17,11 @@ import numpy as np
 from mushpipe.core.arrays import Bools, Floats, Ints32, Singles
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.discs import LIKELY, lens
-from mushpipe.stages.phase_features import AT_LEARNED
-from mushpipe.stages.phase_refit import COSINES, HIDDEN, NARROW, SINES, reach_of, tolerance
-from mushpipe.stages.phase_scratch import Scratch, scratch_for
-from mushpipe.stages.phase_strips import Strips, gather
-from mushpipe.stages.phase_trust import FAINT, mixed, trust_in
+from mushpipe.stages.phase.features import AT_LEARNED
+from mushpipe.stages.phase.refit import COSINES, HIDDEN, NARROW, SINES, reach_of, tolerance
+from mushpipe.stages.phase.scratch import Scratch, scratch_for
+from mushpipe.stages.phase.strips import Strips, gather
+from mushpipe.stages.phase.trust import FAINT, mixed, trust_in
 from mushpipe.stages.verifier_net import Models, probability
 
 MARGIN = 1.0  # px; so far within an accepted circle an outline counts as hidden by it
@@ -187,7 +187,7 @@ def decide(
         models: The models.
         least: Smallest probability that is accepted.
         led: Whether those that are likely come in the order of probability plus `learned`, and
-            the network is believed as far as it sees caps here (`phase_trust`).
+            the network is believed as far as it sees caps here (`phase.trust`).
 
     Returns:
         Rows of the accepted in their order, the probability of every candidate, of every edge point

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from mushpipe.core.arrays import Floats, Ints32, Singles
 from mushpipe.core.jit import borrower
-from mushpipe.stages.cap_blocks import Image
-from mushpipe.stages.cap_model import RADIUS, Single, beside, frozen, meet, slope
-from mushpipe.stages.cap_samples import (
+from mushpipe.stages.cap.blocks import Image
+from mushpipe.stages.cap.model import RADIUS, Single, beside, frozen, meet, slope
+from mushpipe.stages.cap.samples import (
     COMPASS,
     DIRECTIONS,
     EAST,

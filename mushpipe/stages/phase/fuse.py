@@ -6,7 +6,7 @@ import numpy as np
 
 from mushpipe.core.arrays import Bools, Ints32, Singles
 from mushpipe.core.jit import jit
-from mushpipe.stages.phase_edges import DEPTH_ALONE, Edges
+from mushpipe.stages.phase.edges import DEPTH_ALONE, Edges
 
 REACH = 3  # px; so far a gray edge may lie from its depth edge
 UNCONFIRMED = 0.4  # weight of a gray edge without a depth edge beside it

@@ -6,8 +6,8 @@ import numpy as np
 
 from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.jit import borrower
-from mushpipe.stages.cap_model import BULGE, HEIGHT, RADIUS, N
-from mushpipe.stages.cap_solve import ROUND
+from mushpipe.stages.cap.model import BULGE, HEIGHT, RADIUS, N
+from mushpipe.stages.cap.solve import ROUND
 
 # In rim radii: how near the axis points tell of the top, and how far off the dome they are another
 # thing's; least sigma of a point; spread of how far a top is off, and of how that changes with r^2.

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from mushpipe.core.arrays import Floats, Ints, Singles
 from mushpipe.core.jit import borrower, jit
-from mushpipe.stages.cap_blocks import median
-from mushpipe.stages.cap_model import LANES
+from mushpipe.stages.cap.blocks import median
+from mushpipe.stages.cap.model import LANES
 
 WIDE = 32767.0  # columns, more than any image has
 Order = tuple[Ints, NDArray[np.int16]]

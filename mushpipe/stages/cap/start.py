@@ -6,8 +6,8 @@ import numpy as np
 
 from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.jit import borrower
-from mushpipe.stages.cap_linear import solve3
-from mushpipe.stages.cap_model import ASPECT, BULGE, HEIGHT, RADIUS, N, Vector, span
+from mushpipe.stages.cap.linear import solve3
+from mushpipe.stages.cap.model import ASPECT, BULGE, HEIGHT, RADIUS, N, Vector, span
 
 USUAL, CONICAL = (ASPECT, 0.0), (0.85, -0.1)  # aspect and bulge that a fit may start with
 RIM = 0.73  # depth of the rim plane below the middle of the visible part, in heights of the dome

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mushpipe.stages.phase_features import NAMES
+from mushpipe.stages.phase.features import NAMES
 from mushpipe.stages.verifier import package_file
 from mushpipe.stages.verifier_net import Models, read_models
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from mushpipe.core.arrays import Floats, Ints32, Singles
 from mushpipe.core.jit import borrower
-from mushpipe.stages.cap_blocks import (
+from mushpipe.stages.cap.blocks import (
     CELLS,
     COUNT,
     DEPTH,
@@ -28,7 +28,7 @@ from mushpipe.stages.cap_blocks import (
     half_width,
     middle_depth,
 )
-from mushpipe.stages.cap_model import Single, Vector
+from mushpipe.stages.cap.model import Single, Vector
 
 DIRECTIONS = 32
 RADII = 26

@@ -6,7 +6,7 @@ import numpy as np
 
 from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.jit import borrower, inlined
-from mushpipe.stages.cap_model import ROOM, UNKNOWNS, Single, Vector
+from mushpipe.stages.cap.model import ROOM, UNKNOWNS, Single, Vector
 
 Six = tuple[float, float, float, float, float, float]
 

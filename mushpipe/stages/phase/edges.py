@@ -8,7 +8,7 @@ import numpy as np
 
 from mushpipe.core.arrays import Bytes, Ints32, Singles
 from mushpipe.core.jit import borrower, jit
-from mushpipe.stages.phase_thin import thin
+from mushpipe.stages.phase.thin import thin
 
 SIGMA = 1.1
 TOP = 64.0  # gray levels per px; larger gradients count as this in Otsu's threshold

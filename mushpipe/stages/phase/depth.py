@@ -15,7 +15,7 @@ from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.jit import inlined, jit
 from mushpipe.core.types import end_of_scale
 from mushpipe.stages.bed import far_cells, fit_plane, plane_depth
-from mushpipe.stages.phase_edges import Edges, depth_edges
+from mushpipe.stages.phase.edges import Edges, depth_edges
 
 CELL = 2  # px of the image per px of the height map
 GRID = 16  # px of the height map per cell of the bed's fit

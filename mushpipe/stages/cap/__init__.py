@@ -1,0 +1,1 @@
+"""The parts of `cap-fit`: sampling a cap's depth, fitting a spheroid to it, and judging the fit."""

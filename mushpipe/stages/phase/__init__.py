@@ -1,0 +1,1 @@
+"""The parts of `phase-hough`: edges, votes, refits, features, and the decision cap by cap."""
