@@ -573,6 +573,11 @@ class Halved(Level):
     level: Annotated[float, AfterValidator(lambda value: value / 2)]
 
 
+class Above(Level):
+    level: int = 1
+    top: int = Field(300, le=255)
+
+
 class Computed(Level):
     model_config = ConfigDict(arbitrary_types_allowed=True)
     level: int = 1
@@ -585,6 +590,7 @@ class Computed(Level):
         (ReadByName, "grey: 2", "'level' is a name for writing alone; an 'alias' is one for both"),
         (WrittenByName, "level: 2", "'grey' is a name for writing alone"),
         (Halved, "level: 2", "level is 1.0 when written, and then read as 0.5"),
+        (Above, "level: 2", "top: Input should be less than or equal to 255, got 300"),
         (Computed, "level: 2", "Unable to serialize unknown type: <class 'numpy.ndarray'>"),
     ],
 )
