@@ -42,9 +42,25 @@ def set_up_logging(verbose: bool) -> None:
         handler = RichHandler(console=stderr, show_time=False, show_path=False)
         plain = logging.Formatter("%(message)s")
     handler.setFormatter(plain)
+    handler.addFilter(_once())
     logger = logging.getLogger("mushpipe")
     logger.handlers[:] = [handler]
     logger.setLevel(logging.DEBUG if verbose else logging.INFO)
+
+
+def _once() -> Callable[[logging.LogRecord], bool]:
+    """Return a filter that lets each notice pass once: a graph that runs again gives it again."""
+    seen = set[str]()
+
+    def is_new(record: logging.LogRecord) -> bool:
+        if record.levelno != logging.INFO:
+            return True
+        text = record.getMessage()
+        new = text not in seen
+        seen.add(text)
+        return new
+
+    return is_new
 
 
 @contextmanager

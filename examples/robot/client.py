@@ -1,16 +1,16 @@
-"""A robot program that needs nothing but the standard library: docs/robot.md, mode request.
+"""A robot program that needs nothing but the standard library: docs/robot.md, mode request."""
 
-python examples/robot/client.py [PORT]      for the demo, which plays a recording
-"""
-
+import argparse
 import json
 import socket
 import sys
 import time
 from typing import Any
 
-port = int(sys.argv[1]) if len(sys.argv) > 1 else 5005
-with socket.create_connection(("127.0.0.1", port), timeout=3) as sock, sock.makefile("rw") as line:
+parser = argparse.ArgumentParser(description=__doc__)
+parser.add_argument("port", metavar="PORT", nargs="?", type=int, default=5005)
+server = ("127.0.0.1", parser.parse_args().port)
+with socket.create_connection(server, timeout=3) as sock, sock.makefile("rw") as line:
     numbers = iter(range(1, 1 << 53))
 
     def ask(op: str, **fields: Any) -> dict[str, Any]:

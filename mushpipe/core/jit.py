@@ -30,7 +30,7 @@ def _cache_folder() -> Path:
     digest = hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
         text = path.read_bytes()
-        if b"core.jit" in text or path == Path(__file__):
+        if b"core.jit import" in text or path == Path(__file__):
             digest.update(text)
     folder = package / "__pycache__"
     if not os.access(folder if folder.exists() else package, os.W_OK):

@@ -22,6 +22,9 @@ from mushpipe.core.types import Mask, RgbdFrame
 
 # Values are recorded under the names of their types.
 _TAKEN: dict[str, type] = {t.__name__: t for t in (*BUILT_IN, Mask, RgbdFrame)}
+# An array or a number can be anything: who takes one would get that of the nearest who makes one.
+_PLAIN = ("builtins", "numpy")
+_HANDED_ON = "write a type of mushpipe, such as Mask, or a frozen dataclass of your own"
 _METHODS: dict[Kind, str] = {"stage": "process", "source": "frames", "sink": "consume"}
 _BASES: dict[Kind, type[Plugin]] = {"stage": Stage, "source": Source, "sink": Sink}
 
@@ -53,8 +56,8 @@ def ports_of(plugin: type[Plugin]) -> Ports:
 
     Raises:
         PluginError: The method is missing or cannot be called frame by frame, an annotation is
-            missing or not a class, a setting has a name that a graph could not set or files that
-            nobody would look after, or what it returns could not be recorded.
+            missing or no class that stages hand on, a setting has a name that a graph could not
+            set or files that nobody would look after, or what it returns could not be recorded.
     """
     _check_settings(plugin)
     if plugin.__pydantic_custom_init__:
@@ -161,6 +164,11 @@ def _port(plugin: type[Plugin], parameter: Parameter, hints: dict[str, Any]) -> 
         raise PluginError(
             f"{plugin.__qualname__}: parameter '{parameter.name}' must be annotated with one type"
         )
+    if hint.__module__ in _PLAIN:
+        raise PluginError(
+            f"{plugin.__qualname__}: parameter '{parameter.name}' is {hint.__name__}, which no "
+            f"stage hands on: {_HANDED_ON}"
+        )
     return Port(parameter.name, hint, required, default)
 
 
@@ -187,5 +195,10 @@ def _outputs(plugin: type[Plugin], hints: dict[str, Any]) -> tuple[type, ...]:
         if issubclass(output, Columns) and (fault := table_fault(output)):
             raise PluginError(
                 f"{plugin.__qualname__}.process returns {output.__name__}, which {fault}"
+            )
+        if output.__module__ in _PLAIN:
+            raise PluginError(
+                f"{plugin.__qualname__}.process returns {output.__name__}, which no stage hands "
+                f"on: {_HANDED_ON}"
             )
     return outputs

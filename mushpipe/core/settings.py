@@ -90,7 +90,7 @@ def writing_fault(plugin: Plugin) -> str:
         if first["type"] == "extra_forbidden":
             name = ".".join(map(str, first["loc"]))
             return f"'{name}' is a name for writing alone; an 'alias' is one for both"
-        return told(error)
+        return f"{told(error)}, got {first['input']!r}"
     except Exception as error:  # of types that are no data, and of a plugin's own serializers
         return str(error)
     changed = [name for name, value in written.items() if rewritten.get(name) != value]

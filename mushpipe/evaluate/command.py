@@ -9,6 +9,7 @@ from itertools import combinations
 from pathlib import Path
 
 from mushpipe.core.errors import EXIT_DAMAGED, EXIT_DIFFERS, EXIT_OK, InputError, UsageError
+from mushpipe.core.files import recording_of
 from mushpipe.core.overwriting import spare
 from mushpipe.core.paths import real
 from mushpipe.core.plan import Plan
@@ -206,8 +207,7 @@ def _given_truth(request: Request, files: int) -> Sequence[TruthSet | None]:
 def _judge_graph(
     request: Request, graph: Path, folder: Path, runner: Runner
 ) -> tuple[list[Evaluation], int]:
-    others = [path for path in request.targets if path != graph]
-    recordings = recordings_in([*request.recordings, *others])
+    recordings = recordings_in([*request.recordings, *(p for p in request.targets if p != graph)])
     truths: Sequence[TruthSet | None]
     if recordings and not request.truth:
         recordings = _with_truth(recordings)
@@ -217,9 +217,8 @@ def _judge_graph(
     options = alternatives(request.matrix) if request.matrix else [Alternative("")]
     evaluations = {each.label: Evaluation(request.rules, label=each.label) for each in options}
     worst = EXIT_OK
-    played: list[tuple[Path | None, str]] = [(None, "")]
-    if recordings:
-        played = [*zip(recordings, unique_names(recordings), strict=True)]
+    files = zip(recordings, unique_names(recordings), strict=True)
+    played: Sequence[tuple[Path | None, str]] = [*files] or [(None, "")]
     runs = plans(graph, recordings, request.overrides, options, folder)
     for *_, plan in runs:
         spare(result_path(plan), *request.truth)
@@ -233,7 +232,9 @@ def _judge_graph(
             failed = report.failed and not option.label
             logger.warning("%s: %s%s", option.label or graph, report.error, again * bool(failed))
         worst = worst or report.exit_code
-        judged = _judge(request, result_path(plan), truths[number], *played[number])
+        recording, name = played[number]
+        called = name or recording_of(plan.source)
+        judged = _judge(request, result_path(plan), truths[number], recording, called)
         evaluations[option.label].recordings.append(judged)
     for evaluation in evaluations.values():
         _require_judged(evaluation)

@@ -146,6 +146,10 @@ def judge_results(
     _judge_frames(judged, rules)
     if not all(map(comparable, judged.verdicts)):
         judged.notes.append("truth and results are in different frames: 3D errors are unknown")
+    if truth.recording is None and _nothing_fits(judged.verdicts):
+        judged.notes.append(
+            f"nothing was found where {truth.name} has a mushroom: is it of this recording?"
+        )
     if results.failed:
         judged.notes.append(f"{results.failed} frames failed when the graph ran")
     if error := results.summary.get("error"):
@@ -165,6 +169,13 @@ def judge_results(
         )
     judged.verdicts.sort(key=lambda verdict: verdict.place)
     return judged
+
+
+def _nothing_fits(verdicts: Sequence[Verdict]) -> bool:
+    """Return whether there are mushrooms and detections, and none of the ones is of the others."""
+    matchings = [verdict.matching for verdict in verdicts]
+    some = any(len(m.missed) for m in matchings) and any(len(m.false) for m in matchings)
+    return some and not any(len(m.truth) for m in matchings)
 
 
 def _require_exact(results: Results, truth: TruthSet) -> None:

@@ -77,6 +77,8 @@ def _split(address: str) -> tuple[str, int]:
     if not (colon and host and port.isdecimal() and 0 < int(port) < 65536):
         raise typer.BadParameter(f"'{address}' is not host:port, with a port from 1 to 65535")
     host = host.removeprefix("[").removesuffix("]")
+    if host.endswith(":"):  # of ::1, whose end was taken for a port
+        raise typer.BadParameter(f"'{address}' is IPv6 without a port: write [{address}]:5005")
     try:
         host.encode("idna")
     except UnicodeError:  # two dots in a row, more than 63 letters between two
@@ -121,9 +123,11 @@ def client(
     asked = {"max": 10 if most is None else most}
     asked |= {} if max_age_ms is None else {"max_age_ms": max_age_ms}
     talk = _Talk(mode, asked, every, ack or [], raw, count)
+    told = ""
     while not talk.over():
         try:
             with RobotClient(host, port, mode, **hello) as connection:
+                told = ""
                 _converse(connection, talk)
         except _NobodyReads as error:
             raise BrokenPipeError from error
@@ -131,7 +135,9 @@ def client(
             _note(f"refused: {error}")
             raise typer.Exit(1) from None
         except OSError as error:
-            _note(f"{address}: {error}; trying again")
+            if told != str(error):  # once, and not each second until somebody starts the server
+                _note(f"{address}: {error}; trying again")
+            told = str(error)
             time.sleep(1.0)
 
 

@@ -1,7 +1,8 @@
-"""No colour codes where nobody asked for them: in pipes, and under NO_COLOR on a terminal."""
+"""What a terminal or a pipe gets: colour codes where they are wanted, each notice once."""
 
 from __future__ import annotations
 
+import logging
 import os
 import pty
 import re
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from mushpipe import Trace
+from mushpipe.console import set_up_logging
 from tests.io.values import make_frame, record
 
 COLOUR = re.compile(rb"\x1b\[[0-9;]*[0-9]m")
@@ -65,3 +67,21 @@ def _is_colour(code: bytes) -> bool:
     """Return whether a code sets a colour; bold and dim are none."""
     numbers = [int(n) for n in re.findall(rb"\d+", code)]
     return any(30 <= n <= 37 or 40 <= n <= 47 or 90 <= n <= 107 or n in (38, 48) for n in numbers)
+
+
+def test_a_notice_is_given_once_and_a_warning_each_time(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`eval --matrix` and `bench` open the same stages several times."""
+    logger = logging.getLogger("mushpipe")
+    monkeypatch.setattr(logger, "handlers", [])
+    set_up_logging(False)
+    for offset in (2.85, 2.85, 3.0):
+        logger.info("%g mm are taken off", offset)
+        logger.warning("no depth")
+    lines = capsys.readouterr().err.splitlines()
+    assert [line for line in lines if "INFO" in line] == [
+        "INFO: 2.85 mm are taken off",
+        "INFO: 3 mm are taken off",
+    ]
+    assert lines.count("WARNING: no depth") == 3

@@ -66,7 +66,8 @@ def test_a_close_that_fails_stops_no_other(lab: Lab, where):
 
 def test_a_sink_that_fails_to_finish(lab: Lab):
     report = lab.run(recorded(lab, [], "finish sink"))
-    assert str(report.error) == "sink 'out' (rec-sink) failed in finish(): OSError: finish sink"
+    text = "sink 'out' (rec-sink) failed in finish(): OSError: finish sink (-v says where)"
+    assert str(report.error) == text
 
 
 def recorded(lab: Lab, calls: list[str], fails: str = "") -> str:
@@ -153,7 +154,7 @@ def test_a_damaged_recording_ends_with_4_after_all_good_frames(lab: Lab):
 def test_a_source_that_fails_is_named(lab: Lab, error):
     report = lab.run(source_that(lab, lambda: good_then(error)))
     reason = f"{type(error).__name__}: {error}"
-    assert str(report.error) == f"source 'source' (own) failed: {reason}"
+    assert str(report.error) == f"source 'source' (own) failed: {reason} (-v says where)"
     assert (report.processed, report.exit_code) == (2, 1)
 
 
@@ -184,7 +185,7 @@ def test_a_source_that_fails_to_close_does_not_hang(lab: Lab):
             raise OSError("stuck")
 
     report = lab.run(source_that(lab, frames), "source.max_frames=1")
-    assert str(report.error) == "source 'source' (own) failed: OSError: stuck"
+    assert str(report.error) == "source 'source' (own) failed: OSError: stuck (-v says where)"
     assert report.processed == 1
 
 
@@ -195,7 +196,8 @@ def test_a_source_that_cannot_describe_itself(lab: Lab, method):
 
     lab.registry.source("vague", type("Vague", (Frames,), {method: fails}))
     report = lab.run(lab.chain("threshold", source="vague"))
-    assert str(report.error) == f"source 'source' (vague) failed in {method}(): OSError: no idea"
+    text = f"source 'source' (vague) failed in {method}(): OSError: no idea (-v says where)"
+    assert str(report.error) == text
 
 
 def test_what_a_source_lost_is_reported(lab: Lab):

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import AfterValidator, ConfigDict, Field, Json, computed_field
 
-from mushpipe import GraphPath, Mask, RgbdFrame, RunInfo, Sink, SinkPath, Stage
+from mushpipe import Circles, GraphPath, Mask, RgbdFrame, RunInfo, Sink, SinkPath, Stage
 from mushpipe.core.document import Document, parse_document, read_document
 from mushpipe.core.errors import GraphError
 from mushpipe.core.graph import compile_document
@@ -354,12 +354,12 @@ def test_a_fault_of_a_plugin_that_the_command_line_chose_says_so(lab: Lab):
     assert "setting 'size' of 'needy' is missing (with --set a.use=needy)" in faults
 
     class Blind(Stage):
-        def process(self, frame: np.ndarray) -> Mask:
+        def process(self, other: Circles) -> Mask:
             raise NotImplementedError
 
     lab.registry.stage("blind", Blind)
     faults = lab.faults(lab.chain("threshold"), "a.use=blind")
-    assert "produces the ndarray of its 'frame' (with --set a.use=blind)" in faults
+    assert "produces the Circles of its 'other' (with --set a.use=blind)" in faults
 
 
 def test_a_missing_setting_is_placed_at_its_plugin(lab: Lab):
@@ -573,6 +573,11 @@ class Halved(Level):
     level: Annotated[float, AfterValidator(lambda value: value / 2)]
 
 
+class Above(Level):
+    level: int = 1
+    top: int = Field(300, le=255)
+
+
 class Computed(Level):
     model_config = ConfigDict(arbitrary_types_allowed=True)
     level: int = 1
@@ -585,6 +590,7 @@ class Computed(Level):
         (ReadByName, "grey: 2", "'level' is a name for writing alone; an 'alias' is one for both"),
         (WrittenByName, "level: 2", "'grey' is a name for writing alone"),
         (Halved, "level: 2", "level is 1.0 when written, and then read as 0.5"),
+        (Above, "level: 2", "top: Input should be less than or equal to 255, got 300"),
         (Computed, "level: 2", "Unable to serialize unknown type: <class 'numpy.ndarray'>"),
     ],
 )

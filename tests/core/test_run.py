@@ -66,9 +66,8 @@ def test_a_source_that_fails_at_the_end_costs_no_sink_its_frames(lab: Lab, metho
 
     lab.registry.source("going", type("Going", (Frames,), {method: gone}))
     report = lab.run(lab.chain("threshold", source="going"))
-    assert (
-        str(report.error) == f"source 'source' (going) failed in {method}(): OSError: device gone"
-    )
+    text = f"source 'source' (going) failed in {method}(): OSError: device gone (-v says where)"
+    assert str(report.error) == text
     assert counts(report) == (3, 3, 0, 0)
     assert [trace.frame.header.sequence for trace in lab.seen] == [0, 1, 2]
     assert report.sinks["out"].consumed == 3

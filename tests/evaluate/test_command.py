@@ -190,6 +190,21 @@ def test_labels_judge_the_frames_they_name(tmp_path: Path, truths: dict[int, Any
     assert isinstance(run(results, "--truth", labels).exception, InputError)
 
 
+def test_labels_of_another_recording_are_doubted(perfect: Path, tmp_path: Path) -> None:
+    """A number of a frame fits any recording."""
+    labels = tmp_path / "labels.json"
+    caps = [{"u": 20.0, "v": 20.0, "radius_px": 15.0}]
+    for frame, doubted in (({"caps": caps}, True), ({"caps": []}, False)):
+        frames = [{"index": 0, **frame}]
+        labels.write_text(json.dumps({"mushpipe_labels": 1, "frames": frames}))
+        (notes,) = (
+            recording["notes"]
+            for recording in judged(perfect, "--truth", labels)["alternatives"][0]["recordings"]
+        )
+        question = "nothing was found where labels.json has a mushroom: is it of this"
+        assert any(note.startswith(question) for note in notes) == doubted
+
+
 @pytest.mark.parametrize(
     "rounded",
     [
@@ -458,6 +473,7 @@ def test_a_source_that_knows_the_truth_needs_no_recording(graph: Path, tmp_path:
     )
     content = judged(graph, "--report", tmp_path / "report")
     assert content["alternatives"][0]["overall"]["frames"] == 2
+    assert [r["name"] for r in content["alternatives"][0]["recordings"]] == ["beds"]
     assert metrics(content)["f"] > 0.95
     assert (tmp_path / "report" / "index.html").read_text().count("data:image/jpeg") == 2
 

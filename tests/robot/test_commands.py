@@ -60,14 +60,14 @@ def test_it_tries_again_when_the_server_goes_away(monkeypatch: pytest.MonkeyPatc
         class Once(RobotClient):
             def __init__(self, *arguments: Any, **more: Any) -> None:
                 calls.append(1)
-                if len(calls) == 1:
+                if len(calls) < 4:
                     raise ConnectionRefusedError("nobody there")
                 super().__init__(*arguments, **more)
 
         monkeypatch.setattr("mushpipe.robot.client.RobotClient", Once)
         monkeypatch.setattr(commands.time, "sleep", lambda _: None)
         done = robot("client", f"127.0.0.1:{b.port}", "--mode", "stream", "--count", 1, "--raw")
-        assert "nobody there; trying again" in done.output
+        assert done.output.count("nobody there; trying again") == 1
         assert '"op": "targets"' in done.output
 
 
@@ -89,6 +89,10 @@ def test_a_token_and_a_wrong_address(tmp_path: Path) -> None:
         done = robot("client", address, "--count", 1, "--token-file", tmp_path / "token")
         assert "m0" in done.output
     assert robot("client", "5005").exit_code == 2
+    for bare in ("::1", "fe80::1"):
+        done = robot("client", bare)
+        assert done.exit_code == EXIT_USAGE
+        assert f"write [{bare}]:5005" in done.output
 
 
 def test_a_transcript_is_replayed(tmp_path: Path) -> None:
@@ -238,6 +242,12 @@ def test_the_example_picks() -> None:
         command = [sys.executable, ROOT / "examples/robot/client.py", str(b.port)]
         done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
     assert [line.split()[0] for line in done.stdout.splitlines()] == ["m0", "m1", "m2"]
+
+
+def test_the_example_says_what_it_takes() -> None:
+    command = [sys.executable, ROOT / "examples/robot/client.py", "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+    assert "PORT" in done.stdout
 
 
 def test_a_token_that_cannot_be_read_is_not_the_servers_fault(

@@ -136,6 +136,23 @@ def test_a_broken_cache_folder_stops_nothing(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout.strip()) == (0, "400"), done.stderr
 
 
+def test_kernels_are_compiled_anew_where_one_changed_and_only_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own, kernel, other = (tmp_path / name for name in ("core/jit.py", "kernel.py", "console.py"))
+    own.parent.mkdir()
+    own.write_text("")
+    monkeypatch.setattr(jitting, "__file__", str(own))
+    folders = []
+    for number in ("a = 1", "a = 2"):
+        for file in (other, kernel):
+            text = "from mushpipe.core.jit import jit" if file is kernel else "# mushpipe.core.jit"
+            file.write_text(f"{text}\n{number}\n")
+            folders.append(jitting._cache_folder())
+    assert folders[1] == folders[2]
+    assert folders[1] != folders[3]
+
+
 @pytest.mark.parametrize("stage", [CapFit, DepthCorrect, FuseDepth, PhaseHough])
 def test_defaults_are_floats_where_settings_are(stage: type[Stage]) -> None:
     """To a kernel an int is another type: it would be compiled anew where a graph states one."""
