@@ -16,6 +16,10 @@ logger = logging.getLogger("mushpipe")
 NEAREST_M, FARTHEST_M = 0.02, 30.0
 COARSE_M = 0.003  # a cap of 30 mm rises by 9
 WIDEST_DEG = 160.0
+# A usual cap, m, and how wide it is in an image at least, px: twice the least radius of detectors.
+CAP_M, CAP_PX = 0.04, 16.0
+OFF_CENTRE = 1 / 6  # share of the image; of cropped images alone principal points lie further off
+ALIKE = 0.1  # shares, or ratios, that differ by less are the same
 STILL = 30  # frames
 _APART = 16  # px between those that are compared first
 _FEWEST_LEVELS = 6
@@ -66,7 +70,8 @@ def _warned(name: str, frame: RgbdFrame) -> bool:
     known = depth[(depth > 0) & (depth < end_of_scale(depth))] * frame.depth_scale
     if not len(known):
         return False
-    for doubt in (*doubts(known), *doubts_of_camera(frame.camera)):
+    of_camera = list(doubts_of_camera(frame.camera))
+    for doubt in (*doubts(known), *(of_camera or doubts_of_view(known, frame.camera))):
         logger.warning("%s, frame %d: %s", name, frame.header.sequence, doubt)
     return True
 
@@ -94,15 +99,53 @@ def doubts(depth: NDArray[Any]) -> Iterator[str]:
         )
 
 
+def doubts_of_view(depth: NDArray[Any], camera: Camera | None) -> Iterator[str]:
+    """Yield why no caps can be seen at depths (N,), m, none of them missing, and what to do.
+
+    A unit that is wrong by a factor of eight leaves depths that some camera could have measured,
+    but not of caps.
+    """
+    middle = float(np.median(depth)) if len(depth) else 0.0
+    if camera is None or not NEAREST_M <= middle <= FARTHEST_M:
+        return
+    wide = camera.focal * CAP_M / middle
+    if not CAP_PX <= wide <= camera.height / 2:
+        yield (
+            f"half of the depth is {'nearer' if wide > CAP_PX else 'farther'} than {middle:.2g} m, "
+            f"where a cap of {1000 * CAP_M:.0f} mm is {wide:.0f} px wide in an image of "
+            f"{camera.width}x{camera.height}: caps may be missed, and others found; if that is not "
+            "how far the bed is away, set source.depth_scale, or the focal length, to what they are"
+        )
+
+
 def doubts_of_camera(camera: Camera | None) -> Iterator[str]:
     """Yield what is odd about a calibration, and what to do about it."""
     if camera is None:
         return
+    yield from _doubts_of_size(camera)
     view = float(np.degrees(2 * np.arctan2(camera.width / 2, camera.fx)))
     if view > WIDEST_DEG:
         yield (
             f"a focal length of {camera.fx:g} px makes a view of {view:.0f} degrees; where it is "
             "in millimetres, state it in px: mm / width of the sensor in mm x width of the image"
+        )
+
+
+def _doubts_of_size(camera: Camera) -> Iterator[str]:
+    """Yield why a calibration looks as if it were of images of another size, or of other pixels."""
+    x, y = camera.cx / camera.width, camera.cy / camera.height
+    off = min(abs(x - 0.5), abs(y - 0.5))
+    if camera.centred and off > OFF_CENTRE and abs(x - y) < ALIKE:
+        yield (
+            f"the principal point of the calibration, ({camera.cx:g}, {camera.cy:g}), is that of "
+            f"images of about {2 * camera.cx:.0f}x{2 * camera.cy:.0f}, and these are "
+            f"{camera.width}x{camera.height}; unless they were cut out of larger ones, positions "
+            "are off: set source.camera"
+        )
+    if abs(np.log(camera.fx / camera.fy)) > ALIKE:
+        yield (
+            f"focal lengths of {camera.fx:g} and {camera.fy:g} px make pixels that are not square, "
+            "and caps that are not round; make the images so, or set source.camera"
         )
 
 

@@ -16,7 +16,7 @@ from mushpipe import Circles, DepthSource, Locations, PickFlag, Picks, Poses, Rg
 from mushpipe.core.arrays import Floats, Ints, Rows
 from mushpipe.core.errors import UsageError
 from mushpipe.core.transform import Transform, TransformSetting
-from mushpipe.stages.plausible import contradictory
+from mushpipe.stages.plausible import UsualSize, contradictory
 from mushpipe.stages.rows import require_same_rows
 from mushpipe.stages.surroundings import clearance, hidden_share
 from mushpipe.stages.tracks import Tracks
@@ -94,6 +94,7 @@ class MakePicks(Stage):
     _missing: int = PrivateAttr(0)
     _left_out: int = PrivateAttr(0)
     _inward: bool = PrivateAttr(False)
+    _size: UsualSize = PrivateAttr(default_factory=UsualSize)
 
     def open(self) -> None:
         """Compile the kernels, and say where a camera above the bed would look up."""
@@ -128,6 +129,7 @@ class MakePicks(Stage):
         require_same_rows(circles, locations, poses, frame.camera)
         wrong = contradictory(circles, locations, poses, frame.camera)
         locations, poses = locations.without(wrong), poses.without(wrong)
+        self._size.look(frame.header.sequence, locations.diameter)
         poses = self._outward(poses, locations, frame.header.sequence)
         self._total += n
         self._missing += int(locations.missing.sum())

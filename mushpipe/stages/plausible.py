@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 
 from mushpipe import Circles, Locations, Poses
@@ -9,10 +11,38 @@ from mushpipe.core.arrays import Bools, Floats
 from mushpipe.core.geometry import Camera, lengths
 from mushpipe.core.tables import LARGEST_M
 
+logger = logging.getLogger("mushpipe")
+ENOUGH = 8  # caps that tell what is usual
+SMALL_M, LARGE_M = 0.01, 0.1  # pins are smaller, and no variety is larger but for single caps
 _METRES = "are all lengths in metres, and all of this circle?"
 # No unit is mistaken for another by less. What is found differs by a factor of three at most.
 UNIT = 10.0
 MOST = 4.0  # times that the lengths of one row may differ: one of them is of something else
+
+
+class UsualSize:
+    """Warns, once, where the usual cap of a frame is as small or as large as hardly any cap is.
+
+    In metres of another length all of them look as caps do: only their size tells.
+    """
+
+    def __init__(self) -> None:
+        self._told = False
+
+    def look(self, number: int, diameter: Floats) -> None:
+        """Look at the diameters (N,), m, of a frame of such a number; NaN where unknown."""
+        known = diameter[np.isfinite(diameter)]
+        if self._told or len(known) < ENOUGH:
+            return
+        usual = float(np.median(known))
+        if not SMALL_M <= usual <= LARGE_M:
+            self._told = True
+            logger.warning(
+                "frame %d: half of the diameters of %d mushrooms are %s %.0f mm; where caps are of "
+                "another size, positions are as wrong: depth is of another unit "
+                "(source.depth_scale), or the calibration of another camera or size of image",
+                *(number, len(known), "below" if usual < SMALL_M else "above", 1000 * usual),
+            )
 
 
 def contradictory(

@@ -84,3 +84,36 @@ def test_without_a_calibration_a_location_is_in_front_of_the_camera_all_the_same
 def test_what_a_camera_sees_is_taken_and_so_is_what_is_unknown() -> None:
     assert len(MakePicks().process(FRAME, CIRCLES, LOCATIONS, poses(POSITION))) == 2
     assert len(MakePicks().process(FRAME, CIRCLES, Locations.unknown(2))) == 2
+
+
+def of_size(diameter: float, n: int = 9, unknown: int = 0) -> tuple[Circles, Locations]:
+    """Caps of such a diameter, m, at the depth that their circles of 8 px tell then."""
+    circles = Circles([(10 + 15 * k, 60) for k in range(n)], np.full(n, 8), np.ones(n))
+    position = CAMERA.deproject(circles.center, np.full(n, diameter * CAMERA.fx / 16))
+    size = np.where(np.arange(n) < unknown, np.nan, diameter)
+    source = np.full(n, DepthSource.MEASURED)
+    away = np.linalg.norm(position, axis=1)
+    return circles, Locations.unknown(
+        n, position=position, distance=away, diameter=size, source=source
+    )
+
+
+@pytest.mark.parametrize(
+    ("diameter", "n", "unknown", "told"),
+    [
+        (0.03, 9, 0, None),
+        (0.0075, 9, 0, "half of the diameters of 9 mushrooms are below 8 mm"),  # a quarter of it
+        (0.12, 9, 1, "half of the diameters of 8 mushrooms are above 120 mm"),
+        (0.0075, 7, 0, None),  # a few may be pins
+        (0.0075, 9, 2, None),
+        (0.0075, 0, 0, None),
+    ],
+)
+def test_a_bed_of_caps_of_impossible_size_is_told_of_once(
+    diameter: float, n: int, unknown: int, told: str | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    stage, caps = MakePicks(), of_size(diameter, n, unknown)
+    for _ in range(3):
+        assert len(stage.process(FRAME, *caps)) == n
+    assert len(caplog.messages) == (told is not None)
+    assert told is None or told in caplog.messages[0]
