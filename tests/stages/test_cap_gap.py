@@ -13,7 +13,7 @@ import pytest
 from mushpipe import Camera, Circles, Header, Mask, RgbdFrame
 from mushpipe.evaluate.truth import read_truth
 from mushpipe.sources.mcap import McapSource
-from mushpipe.stages.cap.gap import EdgeWatch, edge_gaps, usual
+from mushpipe.stages.cap.gap import AGAIN, EdgeWatch, edge_gaps, usual
 from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.phase_hough import PhaseHough
 from tests.stages.frames import SIMULATED
@@ -100,7 +100,7 @@ def test_a_camera_that_shows_caps_wider_is_told_of_with_what_puts_it_right(
 def test_sigmas_hold_where_edges_are_told_to_be_amiss() -> None:
     """From the frame on that tells it; depth widened by 3 px makes diameters too large by more."""
     watching, blind = CapFit(), CapFit()
-    blind._edges._gaps = None  # as if it had judged, and found nothing
+    blind._edges._told = True  # as if it had judged, and found nothing
     diameter, tilt = {True: list[float](), False: list[float]()}, list[float]()
     for frame, circles in beds("moving"):
         seen = widened(frame, 3)
@@ -208,6 +208,19 @@ def test_a_camera_that_stands_still_is_told_of_after_a_while_and_only_once(
             found = re.search(rf"([\d.]+) px (?:to the )?{side}", text)
             assert found is not None
             assert float(found[1]) == pytest.approx(5, abs=1.3)
+
+
+@pytest.mark.parametrize("right", [0, 6, 25])
+def test_a_camera_that_is_knocked_later_is_told_of(
+    right: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Not at once: it is looked again after a while, and twice."""
+    bed = [pair for name in BEDS for pair in beds(name)]
+    watch, laps = EdgeWatch(), -(-AGAIN // len(bed)) + 2
+    for shift, said in ((0, 0), (right, right != 0)):
+        for frame, circles in laps * bed:
+            watch.look(moved(frame, shift), circles, 0.7)
+        assert len(caplog.messages) == said
 
 
 def test_edges_that_do_not_move_or_lie_on_one_side_are_no_evidence(

@@ -23,6 +23,7 @@ ENOUGH, AMISS, SHIFTED = 100, 1.5, 2.0
 # After so many frames FEW are judged by, too, for a camera that stands still sees no others; they
 # may lie UNSURE further off. It is looked again each time so many frames have come.
 PATIENCE, FEW, UNSURE = 60, 12, 1.5
+AGAIN = 300  # frames after which it is looked again where all was right
 LATEST = 1000  # edges, and circles, that are kept
 # Of so many places where a cap ends in colour, and depth is known all around, this share at least
 # is an edge in depth as well: on beds 0.3 or more, with depth 12 px beside colour 0.16.
@@ -42,16 +43,25 @@ _LEAST_FALL = 0.06  # of luma
 class EdgeWatch:
     """Looks at edges of caps until it can judge where depth shows them; tells what is amiss.
 
+    It goes on looking, for cameras are knocked: what was right before must be amiss twice, and by
+    `UNSURE` px more, since beds differ by some.
+
     Attributes:
         amiss_px: By how much that is, px; 0 where nothing is, or is known yet.
     """
 
     def __init__(self) -> None:
-        self._gaps: Floats | None = np.zeros((0, 3))  # None once they were judged
-        self._seen = np.zeros((0, 2))  # centres of the circles that were looked at, px
-        self._places = self._confirmed = 0
-        self._frames = 0
         self.amiss_px = 0.0
+        self._told = self._once_right = False
+        self._begin(right=False)
+
+    def _begin(self, right: bool) -> None:
+        """Begin anew, at once or, where all was right until now, after a while."""
+        self._right, self._once_right = right, right or self._once_right
+        self._frames = -AGAIN if right else 0
+        self._places = self._confirmed = 0
+        self._gaps = np.zeros((0, 3))
+        self._seen = np.zeros((0, 2))  # centres of the circles that were looked at, px
 
     def look(self, frame: RgbdFrame, circles: Circles, edge_offset_px: float) -> None:
         """Look at a frame; warn, once, where depth shows caps otherwise than colour.
@@ -63,28 +73,38 @@ class EdgeWatch:
         """
         self._frames += 1
         patient = self._frames % PATIENCE == 0
-        if self._gaps is None or (self._frames > PATIENCE and not patient):
+        if self._told or self._frames <= 0 or (self._frames > PATIENCE and not patient):
             return
+        self._gather(frame, circles)
+        strange = self._places >= PLACES and self._confirmed < CONFIRMED * self._places
+        enough = len(self._gaps) >= ENOUGH
+        judged = enough or (patient and len(self._gaps) >= FEW)
+        found = usual(self._gaps) if judged and not strange else None
+        if found is None and not strange:
+            return
+        unsure = 0 if enough and not self._once_right else UNSURE
+        amiss = found is None or any(_amiss(found, edge_offset_px, unsure))
+        if amiss and not self._right:
+            self._tell(found, edge_offset_px, unsure)
+        elif amiss or enough:
+            self._begin(right=not amiss)
+
+    def _gather(self, frame: RgbdFrame, circles: Circles) -> None:
         # Where nothing moves, the same edges again would say nothing new.
         away = np.linalg.norm(circles.center[:, None] - self._seen, axis=2)
         new = circles.take((away > circles.radius[:, None]).all(axis=1))
         self._seen = np.concatenate([self._seen, new.center])[-LATEST:]
-        found_now, places = edge_gaps(frame, new)
-        self._gaps = gaps = np.concatenate([self._gaps, found_now])[-LATEST:]
-        self._places, self._confirmed = self._places + places, self._confirmed + len(found_now)
-        if self._places >= PLACES and self._confirmed < CONFIRMED * self._places:
-            _tell_strange(self._places, self._confirmed)
-            self._gaps = None
-            return
-        enough = len(gaps) >= ENOUGH
-        found = usual(gaps) if enough or (patient and len(gaps) >= FEW) else None
+        found, places = edge_gaps(frame, new)
+        self._gaps = np.concatenate([self._gaps, found])[-LATEST:]
+        self._places, self._confirmed = self._places + places, self._confirmed + len(found)
+
+    def _tell(self, found: Floats | None, stated: float, unsure: float) -> None:
+        self._told = True
         if found is None:
+            _tell_strange(self._places, self._confirmed)
             return
-        amiss = _tell(-found[0], edge_offset_px, (found[1], found[2]), 0 if enough else UNSURE)
-        if amiss:
-            self.amiss_px = float(np.hypot(np.hypot(*found[1:]), found[0] + edge_offset_px))
-        if enough or amiss:
-            self._gaps = None
+        self.amiss_px = float(np.hypot(np.hypot(*found[1:]), found[0] + stated))
+        _tell(found, stated, unsure)
 
 
 def _tell_strange(places: int, confirmed: int) -> None:
@@ -96,18 +116,31 @@ def _tell_strange(places: int, confirmed: int) -> None:
     )
 
 
-def _tell(lost: float, stated: float, shift: tuple[float, float], unsure: float) -> bool:
-    """Warn of what is amiss by more than `unsure` px beyond what may be; return if anything is."""
-    shifted, wider = np.hypot(*shift) > SHIFTED + unsure, abs(lost - stated) > AMISS + unsure
+def _amiss(found: Floats, stated: float, unsure: float) -> tuple[bool, bool]:
+    """Return if depth is shifted, and if it is wider, by more than `unsure` px beyond what may be.
+
+    Args:
+        found: (3,) from `usual`.
+        stated: How much of an edge depth is said to lose, px.
+        unsure: px.
+    """
+    shifted = np.hypot(*found[1:]) > SHIFTED + unsure
+    return bool(shifted), bool(abs(found[0] + stated) > AMISS + unsure)
+
+
+def _tell(found: Floats, stated: float, unsure: float) -> None:
+    """Warn of what is amiss; arguments as `_amiss`."""
+    shifted, wider = _amiss(found, stated, unsure)
     if shifted:
         logger.warning(
             "cap-fit: depth shows caps %.1f px to the %s and %.1f px %s of where colour shows "
             "them: it is not aligned to colour, and positions and axes are wrong; calibrate the "
             "cameras anew",
-            *(abs(shift[0]), "right" if shift[0] > 0 else "left"),
-            *(abs(shift[1]), "below" if shift[1] > 0 else "above"),
+            *(abs(found[1]), "right" if found[1] > 0 else "left"),
+            *(abs(found[2]), "below" if found[2] > 0 else "above"),
         )
     if wider:
+        lost = -found[0]
         logger.warning(
             "cap-fit: edges of caps in depth lie %.1f px %s of those in colour, where "
             "edge_offset_px: %g takes them for %.1f px %s; diameters are too %s: set "
@@ -118,7 +151,6 @@ def _tell(lost: float, stated: float, shift: tuple[float, float], unsure: float)
             "large" if lost < stated else "small",
             np.clip(lost, -3, 3),
         )
-    return bool(shifted or wider)
 
 
 def usual(gaps: Floats) -> Floats | None:
