@@ -227,7 +227,10 @@ _COPY = "frames and tables belong to all stages: copy an array before changing i
 FAILURES = {
     "writes into the frame": (Writes, f"ValueError: assignment destination is read-only; {_COPY}"),
     "writes into the mask": (WritesMask, f"ValueError: output array is read-only; {_COPY}"),
-    "returns nothing": (Forgets, "declared is (Mask); is a `return` missing?"),
+    "returns nothing": (
+        Forgets,
+        "TypeError: it returned (NoneType), declared is (Mask); is a `return` missing?",
+    ),
     "returns another order": (
         ReturnsAnother,
         "TypeError: it returned (Circles, Mask), declared is (Mask, Circles)",
