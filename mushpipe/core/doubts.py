@@ -108,6 +108,8 @@ def doubts_of_view(depth: NDArray[Any], camera: Camera | None) -> Iterator[str]:
     middle = float(np.median(depth)) if len(depth) else 0.0
     if camera is None or not NEAREST_M <= middle <= FARTHEST_M:
         return
+    if camera.height < 2 * CAP_PX:  # of a test, say: a cap is too small or too large in any case
+        return
     wide = camera.focal * CAP_M / middle
     if not CAP_PX <= wide <= camera.height / 2:
         yield (

@@ -27,6 +27,7 @@ from tests.cli.shell import MAIN, mushpipe
 from tests.core.lab import PATIENCE_S
 
 CAMERA = Camera(160, 120, 154.0, 154.5, 80.2, 59.7)
+SCALE = 1e-5  # m: caps of a usual size are neither too small for such an image nor too large
 IMAGES = 23
 CHUNK = 2**20
 
@@ -44,7 +45,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     writer = RecordingWriter(path, {"mushpipe.manifest": {"json": "{}"}})
     for i in range(IMAGES):
         header = Header(10**18 + i * 33_000_000, i, "camera_color_optical_frame")
-        writer.frame(RgbdFrame(header, *picture(i), 0.000125, CAMERA))
+        writer.frame(RgbdFrame(header, *picture(i), SCALE, CAMERA))
     writer.close()
     return path
 
@@ -62,7 +63,7 @@ def played(path: Path) -> tuple[list[RgbdFrame], str]:
         assert np.array_equal(frame.color, color)
         assert frame.depth is not None
         assert np.array_equal(frame.depth, depth)
-        assert (frame.depth_scale, frame.camera) == (0.000125, CAMERA)
+        assert (frame.depth_scale, frame.camera) == (SCALE, CAMERA)
     return frames, damage
 
 
@@ -177,7 +178,7 @@ class Fast(Source):
 
     def frames(self) -> Iterator[RgbdFrame]:
         for i in range(100):
-            yield RgbdFrame(Header(10**18 + i, i, "camera"), *picture(i), 0.000125, CAMERA)
+            yield RgbdFrame(Header(10**18 + i, i, "camera"), *picture(i), 1e-5, CAMERA)
         Path("shown").touch()
 """
 
