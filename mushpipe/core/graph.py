@@ -97,8 +97,14 @@ def compile_document(
         for kind, group in entries.items()
     }
     complete = [node for group in nodes.values() for node in group if node is not None]
-    if nodes["source"] and len(complete) == sum(map(len, nodes.values())) and _shaped(document):
-        problems += wire(document, registry, complete)
+    if nodes["source"] and _shaped(document):
+        unknown = {
+            str(at[-1])
+            for kind in ("source", "stage")
+            for (at, _), node in zip(entries[kind], nodes[kind], strict=True)
+            if node is None
+        }
+        problems += wire(document, registry, complete, unknown)
     if not problems:
         problems += _check_files(document, complete)
     if problems or head is None:

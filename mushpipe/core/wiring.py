@@ -6,6 +6,7 @@ for it: the nearest goes to the other, and which of those farther up is meant ca
 
 from __future__ import annotations
 
+from collections.abc import Set
 from contextlib import suppress
 
 from mushpipe.core.document import Document, Location
@@ -19,8 +20,13 @@ from mushpipe.core.types import Trace
 _SHARE = "plugins share a type that they import from one package, or define in one file"
 
 
-def wire(document: Document, registry: Registry, nodes: list[Node]) -> list[Problem]:
+def wire(
+    document: Document, registry: Registry, nodes: list[Node], unknown: Set[str] = frozenset()
+) -> list[Problem]:
     """Fill the links of all nodes, given source first, then stages, then sinks, in file order.
+
+    Of stages that are `unknown`, by their names, nobody can say what they produce: what may come
+    from them is no fault.
 
     An output that nobody takes becomes a warning of the document, and so do an input that is left
     open though a stage above needs one of that name, and locations or poses that are of other
@@ -29,8 +35,8 @@ def wire(document: Document, registry: Registry, nodes: list[Node]) -> list[Prob
     problems = _check_names(document, nodes)
     for position, node in enumerate(nodes):
         above = [other for other in nodes[:position] if other.kind != "sink"]
-        unknown = node.asked.keys() - {port.name for port in node.ports.inputs}
-        for name in sorted(unknown):
+        misspelt = node.asked.keys() - {port.name for port in node.ports.inputs}
+        for name in sorted(misspelt):
             at = (*_place(node), "inputs", name)
             hint = suggest(name, [port.name for port in node.ports.inputs])
             problems.append(document.problem(at, f"'{node.use}' has no input '{name}'", hint, True))
@@ -41,7 +47,7 @@ def wire(document: Document, registry: Registry, nodes: list[Node]) -> list[Prob
                     message = f"'{port.name}' of '{node.use}' is everything that all stages found"
                     problems.append(document.problem(at, message, "leave it out", key=True))
                 continue
-            problem = _connect(document, registry, node, port, above, nodes)
+            problem = _connect(document, registry, node, port, above, nodes, unknown)
             problems += [problem] if problem else []
     if not problems:
         _warn_unused(document, nodes)
@@ -57,11 +63,14 @@ def _connect(
     port: Port,
     above: list[Node],
     nodes: list[Node],
+    unknown: Set[str],
 ) -> Problem | None:
     wanted = node.asked.get(port.name)
     link = _nearest(port, wanted, above)
     if link and (wanted or not _is_second(port, node)):
         node.links[port.name] = link
+        return None
+    if wanted in unknown or (unknown and wanted is None):
         return None
     at = _place(node)
     if wanted is not None:

@@ -610,6 +610,24 @@ def test_all_inputs_that_cannot_be_wired_are_reported_together(lab: Lab):
     assert text.count("nothing above") == 2
 
 
+def test_a_plugin_that_is_not_known_hides_no_fault_of_others_and_makes_none(lab: Lab):
+    """It may produce anything: what it is asked for, and what is found nowhere else."""
+    text = lab.faults("""
+        mushpipe: 1
+        source: {use: frames}
+        stages:
+          a: {use: nothing-like-it}
+          b: {use: invert, inputs: {mask: a}}
+          c: {use: invert, inputs: {mask: d}}
+          d: {use: measure}
+          e: {use: invert, inputs: {maks: a}}
+    """)
+    lines = [line.split(": ", 1) for line in text.splitlines() if line.startswith("graph.yaml")]
+    assert [place for place, _ in lines] == [f"graph.yaml:{at}" for at in ("4:12", "6:35", "8:29")]
+    assert "'d' stands below 'c'" in lines[1][1]
+    assert "'invert' has no input 'maks'" in lines[2][1]
+
+
 def finds(made: type) -> type[Stage]:
     def process(self, frame: RgbdFrame) -> made: ...
 
