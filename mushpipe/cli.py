@@ -46,7 +46,8 @@ SetOption = Annotated[
 SourceOption = Annotated[
     str | None,
     typer.Option(
-        "--source", help="recording or folder of images to play, source plugin, or - for a stream"
+        "--source",
+        help="recording, image or folder of images, source plugin, or - for a stream",
     ),
 ]
 FramesOption = Annotated[int | None, typer.Option("--frames", help="stop after N frames")]

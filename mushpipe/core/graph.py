@@ -17,7 +17,7 @@ from mushpipe.core.faults import faults_of
 from mushpipe.core.files import files_of
 from mushpipe.core.overrides import apply_override, encoding_fault
 from mushpipe.core.overwriting import clashes
-from mushpipe.core.paths import from_home, real
+from mushpipe.core.paths import IMAGES, from_home, real
 from mushpipe.core.plan import Node, Plan
 from mushpipe.core.plugins import Registry, in_file
 from mushpipe.core.ports import OF_SOURCE, ports_of
@@ -166,7 +166,7 @@ def _replace_source(document: Document, source: str, registry: Registry) -> None
         given = {"use": source}
     elif source.lower().endswith(".bag"):
         given = {"use": "realsense", "file": source}
-    elif Path(source).is_dir():
+    elif Path(source).is_dir() or Path(source).suffix.lower() in IMAGES:
         given = {"use": "images", "path": source}
     elif not (Path(source).exists() or Path(source).suffix):
         hint = suggest(source, registry.names("source"))

@@ -17,6 +17,8 @@ from mushpipe.core.errors import UsageError
 
 STDIO = Path("-")
 """In place of a file: standard output."""
+IMAGES = frozenset([".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm"])
+"""How names of images end, in lower case."""
 
 
 def from_home(path: str | Path) -> Path:

@@ -1,4 +1,4 @@
-"""Source `images`: plays a folder of image files."""
+"""Source `images`: plays a folder of image files, or one."""
 
 from __future__ import annotations
 
@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from mushpipe import Header, InputError, ReplaySource, RgbdFrame, UsageError
-from mushpipe.core.paths import GraphPath, require_listed
+from mushpipe.core.paths import IMAGES, GraphPath, require_listed
 from mushpipe.core.types import COLOR_FRAME
 from mushpipe.sources.recorded import NO_CAMERA, NO_DEPTH, Intrinsics
 
 logger = logging.getLogger("mushpipe")
-SUFFIXES = frozenset(["png", "jpg", "jpeg", "tif", "tiff", "bmp", "webp", "pgm", "ppm"])
 RECORDINGS = (".mcap", ".db3", ".bag", ".zstd")  # what may stand in a folder that is a ROS 2 bag
 _TO_RGB = cv2.COLOR_BGR2RGB
 ALONE = "%s images without a %s image"
@@ -35,7 +34,7 @@ class ImagesSource(ReplaySource):
     were taken: the first frame has the stamp 0, and the others follow at `fps`.
     """
 
-    path: GraphPath = Field(description="the folder")
+    path: GraphPath = Field(description="the folder, or a single colour image")
     color: str = Field(
         "*", description="names of the colour images below the folder: rgb/*.png, or *_color.jpg"
     )
@@ -70,6 +69,8 @@ class ImagesSource(ReplaySource):
 
     def files(self) -> tuple[Path, ...]:
         """Return all images."""
+        if self.path.is_file():
+            return (self.path,)
         found = (_named(self.path, names) for names in (self.color, self.depth) if names)
         return tuple(path for images in found for path in images.values())
 
@@ -77,7 +78,7 @@ class ImagesSource(ReplaySource):
         """Find the images.
 
         Raises:
-            UsageError: There is no such folder.
+            UsageError: There is no such folder or image, or depth for a single image.
             InputError: It holds no such images, or none that belong together.
         """
         self._found = self._pairs()
@@ -102,8 +103,12 @@ class ImagesSource(ReplaySource):
 
     def _pairs(self) -> list[tuple[Path, Path | None]]:
         """Return each colour image with its depth image, and count those that are alone."""
+        if self.path.is_file():
+            if self.depth is not None:
+                raise UsageError(f"{self.path}: a single image has no depth: give its folder")
+            return [(self.path, None)]
         if not self.path.is_dir():
-            raise UsageError(f"{self.path}: there is no such folder")
+            raise UsageError(f"{self.path}: there is no such folder, and no such image")
         colors = _required(self.path, "color", self.color)
         if self.depth is None:
             return [(path, None) for path in colors.values()]
@@ -194,7 +199,7 @@ def _natural(text: str) -> list[str | int]:
 def _is_image(path: Path) -> bool:
     if path.name.startswith("."):  # as a shell does; a Mac puts ._7.png beside each 7.png
         return False
-    return path.suffix[1:].lower() in SUFFIXES and path.is_file()
+    return path.suffix.lower() in IMAGES and path.is_file()
 
 
 def _read(path: Path, how: int) -> NDArray[Any]:

@@ -45,6 +45,20 @@ def played(folder: Path, **settings: Any) -> list[RgbdFrame]:
     return list(source(folder, **settings).frames())
 
 
+def test_a_single_image_is_played_by_its_name(tmp_path: Path) -> None:
+    photo = tmp_path / "IMG 7.JPG"
+    write(photo, 90)
+    write(tmp_path / "other.png", 30)
+    graph = read_document(ROOT / "graphs/pick.yaml")
+    plugin = compile_document(graph, load_registry(), source=str(photo)).source.plugin
+    assert isinstance(plugin, ImagesSource)
+    assert (plugin.name(), plugin.files()) == ("IMG 7", (photo,))
+    (frame,) = played(photo)
+    assert frame.color.mean() == pytest.approx(90, abs=2)
+    with pytest.raises(UsageError, match="a single image has no depth: give its folder"):
+        source(photo, depth="*.png", depth_scale=0.001)
+
+
 def test_a_recording_as_image_files_gives_the_same_picks(tmp_path: Path) -> None:
     recording = ROOT / "recordings/dense.mcap"
     frames = []
@@ -189,7 +203,7 @@ def test_what_is_not_there_is_told_with_what_is(
     write(tmp_path / "d/d0.png", 1, np.uint16, 1)
     with pytest.raises(InputError, match=re.escape(message)):
         source(tmp_path, **settings)
-    with pytest.raises(UsageError, match="there is no such folder"):
+    with pytest.raises(UsageError, match="there is no such folder, and no such image"):
         source(tmp_path / "nowhere")
     write(tmp_path / "c0.jpg", 1)
     with pytest.raises(InputError, match=r"c0\.jpg and c0\.png are one image to '\*'"):
