@@ -89,8 +89,9 @@ def test_the_graph_and_the_segmenter_of_the_docs_work(tmp_path: Path) -> None:
 
 def test_the_plugins_of_the_docs_work(tmp_path: Path) -> None:
     page = Path("docs/plugins.md").read_text()
-    code = "\n".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL))
-    (tmp_path / "mine.py").write_text(code)
+    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    assert Path("examples/mine.py").read_text().endswith(blocks[0])
+    (tmp_path / "mine.py").write_text("\n".join(blocks))
     (tmp_path / "shots").mkdir()
     picture = np.zeros((60, 80, 3), np.uint8)
     cv2.circle(picture, (30, 20), 9, (255, 255, 255), -1)
