@@ -86,7 +86,7 @@ def boxes_of(found: Floats, kind: str, class_id: int) -> tuple[Floats, Floats]:
     objectness, classes = (rows[:, 4], rows[:, 5:]) if kind == "yolov5" else (1.0, rows[:, 4:])
     if not 0 <= class_id < classes.shape[1]:
         raise IndexError(f"classes: {classes.shape[1]}")
-    if kind == "yolov8" and rows.shape[1] > len(rows) >= 5:
+    if rows.shape[1] > len(rows) >= 5:
         raise ValueError("there are more classes than boxes: rows and columns are exchanged")
     if kind == "yolov5" and classes.shape[1] == 1 and len(rows) and _are_kept(rows):
         raise ValueError("the last column holds whole numbers, as in output 'yolov10'")

@@ -48,6 +48,7 @@ def test_labels_are_whole_and_probabilities_within_one() -> None:
     (BOX[..., :5] / 320, "yolov8", "rows and columns are exchanged"),
     (KEPT, "yolov5", "as in output 'yolov10'"),
     (BOX, "yolov8", "rows and columns are exchanged"),
+    (BOX[..., :5].transpose(0, 2, 1) / 320, "yolov5", "rows and columns are exchanged"),
     (BOX[..., :6], "yolov10", "the last column holds no classes"),
     (BOX, "yolov10", "columns: 8"),
     (BOX * 2, "yolov5", "scores are"),
