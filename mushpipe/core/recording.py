@@ -51,7 +51,8 @@ _OTHERS = {
     "viewer is played where its name ends with .bag",
     ZSTD: "compressed as a whole: 'zstd -d FILE' unpacks it",
     **dict.fromkeys(
-        (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"), "an image: give its folder to play all of them"
+        (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"),
+        "an image: 'mushpipe record --source IMAGE -o FILE' makes a recording of one or a folder",
     ),
 }
 

@@ -191,8 +191,11 @@ def test_a_record_whose_type_is_damaged_is_missed(whole: Path, tmp_path: Path) -
         (b"", "the file is empty"),
         (b"MThd\0\0\0\6\0", "not an MCAP file (it begins with b'MThd\\x00\\x00\\x00\\x06')"),
         (b"\x89MC", "not an MCAP file"),
-        (b"\xff\xd8\xff\xe0\0\x10JFIF", "not an MCAP file (it is an image: give its folder"),
-        (b"\x89PNG\r\n\x1a\n\0\0", "not an MCAP file (it is an image: give its folder"),
+        (
+            b"\xff\xd8\xff\xe0\0\x10JFIF",
+            "not an MCAP file (it is an image: 'mushpipe record --source",
+        ),
+        (b"\x89PNG\r\n\x1a\n\0\0", "not an MCAP file (it is an image: 'mushpipe record --source"),
     ],
 )
 def test_a_file_that_is_no_recording_is_refused(
