@@ -223,6 +223,34 @@ def test_a_camera_that_is_knocked_later_is_told_of(
         assert len(caplog.messages) == said
 
 
+def panned(frame: RgbdFrame, circles: Circles, x: int, late: int) -> tuple[RgbdFrame, Circles]:
+    """What a camera of 480x360 px sees x px to the right, with depth of so many px before."""
+    camera, color, depth = frame.camera, frame.color[60:420, x:][:, :480], frame.depth
+    assert camera is not None
+    assert depth is not None
+    view = replace(camera, width=480, height=360, cx=camera.cx - x, cy=camera.cy - 60)
+    seen = RgbdFrame(frame.header, color, depth[60:420, x - late :][:, :480], 0.000125, view)
+    center = circles.center - [x, 60]
+    inside = ((center > 0) & (center < [480, 360])).all(axis=1)
+    return seen, Circles(center, circles.radius, circles.score).take(inside)
+
+
+@pytest.mark.parametrize("step", [4, 18])
+@pytest.mark.parametrize("name", BEDS)
+def test_depth_that_is_one_picture_late_is_told_of_while_the_camera_moves(
+    name: str, step: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    bed, circles = beds(name)[0]
+    way = [*range(step, 143, step), *range(142, step, -step)]
+    for late in (0, step):
+        watch = EdgeWatch()
+        for turn in range(60):
+            ahead = turn % len(way) < len(way) // 2
+            x = way[turn % len(way)]
+            watch.look(*panned(bed, circles, x, late if ahead else -late), 0.7)
+        assert len(caplog.messages) == (late > 0)
+
+
 def test_edges_that_do_not_move_or_lie_on_one_side_are_no_evidence(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
