@@ -223,6 +223,27 @@ def test_a_camera_that_is_knocked_later_is_told_of(
         assert len(caplog.messages) == said
 
 
+@pytest.mark.parametrize(
+    ("name", "down", "right"),
+    [("dense", 1, -1), ("moving", -1, -1), ("tilted", -1, 1), ("brown", 1, -1), ("brown", -1, 1)],
+)
+def test_mirrored_depth_is_told_of_by_a_camera_that_stands_still(
+    name: str, down: int, right: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Of what is found there by both, few edges are in depth, and these lie anywhere."""
+    bed, _ = beds(name)[0]
+    assert bed.depth is not None
+    for frame in (bed, replace(bed, depth=bed.depth[::down, ::right].copy())):
+        every = Mask(np.ones(bed.color.shape[:2], np.bool_))
+        found = PhaseHough(radius_px=(8, 80), min_score=0.5).process(frame, every)
+        watch = EdgeWatch()
+        for _ in range(59):
+            watch.look(frame, found, 0.7)
+        assert caplog.messages == []
+        watch.look(frame, found, 0.7)
+        assert len(caplog.messages) == (frame is not bed)
+
+
 def panned(frame: RgbdFrame, circles: Circles, x: int, late: int) -> tuple[RgbdFrame, Circles]:
     """What a camera of 480x360 px sees x px to the right, with depth of so many px before."""
     camera, color, depth = frame.camera, frame.color[60:420, x:][:, :480], frame.depth

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from mushpipe import Circles, RgbdFrame
-from mushpipe.core.arrays import Floats, Singles
+from mushpipe.core.arrays import Bools, Floats, Singles
 
 logger = logging.getLogger("mushpipe")
 
@@ -26,8 +26,11 @@ PATIENCE, FEW, UNSURE = 60, 12, 1.5
 AGAIN = 300  # frames after which it is looked again where all was right
 LATEST = 1000  # edges, and circles, that are kept
 # Of so many places where a cap ends in colour, and depth is known all around, this share at least
-# is an edge in depth as well: on beds 0.3 or more, with depth 12 px beside colour 0.16.
+# is an edge in depth as well, and lies as they usually do: on 147 beds 0.24 or more; with depth
+# mirrored, turned, or 12 px and more beside colour half of them have 0.1 at most. And the same
+# for a camera that stands still.
 PLACES, CONFIRMED = 200, 0.2
+FEW_PLACES, HARDLY = 40, 0.15
 _OUTLIER = 2.0  # px from what is usual
 # Least eigenvalue of the normal matrix; 0.5 where all sides are alike. A projector's shadow hides
 # depth beside each cap on one side: beds have 0.05 to 0.3, and tell shifts of 5 px to about 1 px.
@@ -76,16 +79,14 @@ class EdgeWatch:
         if self._told or self._frames <= 0 or (self._frames > PATIENCE and not patient):
             return
         self._gather(frame, circles)
-        strange = self._places >= PLACES and self._confirmed < CONFIRMED * self._places
-        enough = len(self._gaps) >= ENOUGH
-        judged = enough or (patient and len(self._gaps) >= FEW)
-        found = usual(self._gaps) if judged and not strange else None
-        if found is None and not strange:
+        found = usual(self._gaps) if len(self._gaps) >= FEW else None
+        strange, enough = self._strange(found, patient), len(self._gaps) >= ENOUGH
+        if not strange and (found is None or not (enough or patient)):
             return
         unsure = 0 if enough and not self._once_right else UNSURE
-        amiss = found is None or any(_amiss(found, edge_offset_px, unsure))
+        amiss = strange or (found is not None and any(_amiss(found, edge_offset_px, unsure)))
         if amiss and not self._right:
-            self._tell(found, edge_offset_px, unsure)
+            self._tell(None if strange else found, edge_offset_px, unsure)
         elif amiss or enough:
             self._begin(right=not amiss)
 
@@ -97,6 +98,14 @@ class EdgeWatch:
         found, places = edge_gaps(frame, new)
         self._gaps = np.concatenate([self._gaps, found])[-LATEST:]
         self._places, self._confirmed = self._places + places, self._confirmed + len(found)
+
+    def _strange(self, found: Floats | None, patient: bool) -> bool:
+        """Return whether edges in depth are hardly more than there are by chance."""
+        agreeing = 1.0 if found is None else float(_near(self._gaps, found, _OUTLIER).mean())
+        share = agreeing * self._confirmed / max(self._places, 1)
+        if self._places >= PLACES:
+            return share < CONFIRMED
+        return patient and self._places >= FEW_PLACES and share < HARDLY
 
     def _tell(self, found: Floats | None, stated: float, unsure: float) -> None:
         self._told = True
@@ -110,8 +119,9 @@ class EdgeWatch:
 def _tell_strange(places: int, confirmed: int) -> None:
     """Warn that depth shows hardly any of the edges that colour shows."""
     logger.warning(
-        "cap-fit: of %d places where colour shows the edge of a cap, depth has one at %d only: it "
-        "is not aligned to colour, or of another moment or scene; positions are not to be trusted",
+        "cap-fit: of %d places where colour shows the edge of a cap, depth has one at %d, as many "
+        "as by chance: it is not aligned to colour, or of another moment or scene; positions are "
+        "not to be trusted",
         *(places, confirmed),
     )
 
@@ -162,14 +172,23 @@ def usual(gaps: Floats) -> Floats | None:
     Returns:
         None where the edges lie on so few sides that the three cannot be told apart.
     """
-    basis = np.column_stack([np.ones(len(gaps)), gaps[:, 1:]])
+    basis = _basis(gaps)
     if np.linalg.eigvalsh(basis.T @ basis / len(gaps))[0] < _LEAST_SPREAD:
         return None
     found = np.array([np.median(gaps[:, 0]), 0.0, 0.0])
     for reach in (4 * _OUTLIER, 2 * _OUTLIER, _OUTLIER, _OUTLIER):
-        near = np.abs(gaps[:, 0] - basis @ found) <= reach
+        near = _near(gaps, found, reach)
         found = np.linalg.lstsq(basis[near], gaps[near, 0], rcond=None)[0]
     return found
+
+
+def _basis(gaps: Floats) -> Floats:
+    return np.column_stack([np.ones(len(gaps)), gaps[:, 1:]])
+
+
+def _near(gaps: Floats, found: Floats, reach: float) -> Bools:
+    """Return which gaps (K, 3) are as is usual (3,), to so many px."""
+    return np.asarray(np.abs(gaps[:, 0] - _basis(gaps) @ found) <= reach)
 
 
 def edge_gaps(frame: RgbdFrame, circles: Circles) -> tuple[Floats, int]:
