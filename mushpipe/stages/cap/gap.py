@@ -110,6 +110,7 @@ class EdgeWatch:
     def _tell(self, found: Floats | None, stated: float, unsure: float) -> None:
         self._told = True
         if found is None:
+            self.amiss_px = _REACH  # or more
             _tell_strange(self._places, self._confirmed)
             return
         self.amiss_px = float(np.hypot(np.hypot(*found[1:]), found[0] + stated))
