@@ -24,7 +24,6 @@ from mushpipe.core.types import Mask, RgbdFrame
 _TAKEN: dict[str, type] = {t.__name__: t for t in (*BUILT_IN, Mask, RgbdFrame)}
 # An array or a number can be anything: who takes one would get that of the nearest who makes one.
 _PLAIN = ("builtins", "numpy")
-_HANDED_ON = "write a type of mushpipe, such as Mask, or a frozen dataclass of your own"
 _METHODS: dict[Kind, str] = {"stage": "process", "source": "frames", "sink": "consume"}
 _BASES: dict[Kind, type[Plugin]] = {"stage": Stage, "source": Source, "sink": Sink}
 
@@ -164,12 +163,17 @@ def _port(plugin: type[Plugin], parameter: Parameter, hints: dict[str, Any]) -> 
         raise PluginError(
             f"{plugin.__qualname__}: parameter '{parameter.name}' must be annotated with one type"
         )
-    if hint.__module__ in _PLAIN:
-        raise PluginError(
-            f"{plugin.__qualname__}: parameter '{parameter.name}' is {hint.__name__}, which no "
-            f"stage hands on: {_HANDED_ON}"
-        )
+    _require_handed_on(hint, f"{plugin.__qualname__}: parameter '{parameter.name}' is")
     return Port(parameter.name, hint, required, default)
+
+
+def _require_handed_on(kind: type, what: str) -> None:
+    """Raise PluginError, which begins with what is of a type, where that is none of a port."""
+    if kind.__module__ in _PLAIN:
+        raise PluginError(
+            f"{what} {kind.__name__}, which no stage hands on: write a type of mushpipe, such as "
+            "Mask, or a frozen dataclass of your own"
+        )
 
 
 def _is_class(hint: Any) -> typing.TypeGuard[type]:
@@ -196,9 +200,5 @@ def _outputs(plugin: type[Plugin], hints: dict[str, Any]) -> tuple[type, ...]:
             raise PluginError(
                 f"{plugin.__qualname__}.process returns {output.__name__}, which {fault}"
             )
-        if output.__module__ in _PLAIN:
-            raise PluginError(
-                f"{plugin.__qualname__}.process returns {output.__name__}, which no stage hands "
-                f"on: {_HANDED_ON}"
-            )
+        _require_handed_on(output, f"{plugin.__qualname__}.process returns")
     return outputs

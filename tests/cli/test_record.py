@@ -171,14 +171,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import ClassVar
 from mushpipe import Header, RgbdFrame, Source
-from tests.cli.test_record import CAMERA, picture
+from tests.cli.test_record import CAMERA, SCALE, picture
 
 class Fast(Source):
     live: ClassVar[bool] = True
 
     def frames(self) -> Iterator[RgbdFrame]:
         for i in range(100):
-            yield RgbdFrame(Header(10**18 + i, i, "camera"), *picture(i), 1e-5, CAMERA)
+            yield RgbdFrame(Header(10**18 + i, i, "camera"), *picture(i), SCALE, CAMERA)
         Path("shown").touch()
 """
 

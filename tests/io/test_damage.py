@@ -185,17 +185,17 @@ def test_a_record_whose_type_is_damaged_is_missed(whole: Path, tmp_path: Path) -
     assert "1 of its messages are missing" in str(error)
 
 
+AN_IMAGE = "not an MCAP file (it is an image: 'mushpipe record"
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
         (b"", "the file is empty"),
         (b"MThd\0\0\0\6\0", "not an MCAP file (it begins with b'MThd\\x00\\x00\\x00\\x06')"),
         (b"\x89MC", "not an MCAP file"),
-        (
-            b"\xff\xd8\xff\xe0\0\x10JFIF",
-            "not an MCAP file (it is an image: 'mushpipe record --source",
-        ),
-        (b"\x89PNG\r\n\x1a\n\0\0", "not an MCAP file (it is an image: 'mushpipe record"),
+        (b"\xff\xd8\xff\xe0\0\x10JFIF", f"{AN_IMAGE} --source IMAGE -o FILE'"),
+        (b"\x89PNG\r\n\x1a\n\0\0", f"{AN_IMAGE} --source IMAGE -o FILE'"),
     ],
 )
 def test_a_file_that_is_no_recording_is_refused(

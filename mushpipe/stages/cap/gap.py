@@ -79,8 +79,11 @@ class EdgeWatch:
         if self._told or self._frames <= 0 or (self._frames > PATIENCE and not patient):
             return
         self._gather(frame, circles)
+        enough = len(self._gaps) >= ENOUGH
+        if not (enough or patient or self._places >= PLACES):
+            return
         found = usual(self._gaps) if len(self._gaps) >= FEW else None
-        strange, enough = self._strange(found, patient), len(self._gaps) >= ENOUGH
+        strange = self._strange(found, patient)
         if not strange and (found is None or not (enough or patient)):
             return
         unsure = 0 if enough and not self._once_right else UNSURE
