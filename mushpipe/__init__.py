@@ -4,6 +4,7 @@ This module is what a plugin author needs.
 """
 
 import mushpipe.core.interrupt  # noqa: F401 - before what takes long to import
+from mushpipe.core.columns import Columns, column
 from mushpipe.core.errors import (
     DependencyError,
     DeviceError,
@@ -17,13 +18,11 @@ from mushpipe.core.plugins import Registry, hookimpl
 from mushpipe.core.stage import ReplaySource, RunInfo, Sink, Source, Stage
 from mushpipe.core.tables import (
     Circles,
-    Columns,
     DepthSource,
     Locations,
     PickFlag,
     Picks,
     Poses,
-    column,
 )
 from mushpipe.core.types import Header, Mask, RgbdFrame, Trace
 

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from mushpipe.core.columns import Columns
 from mushpipe.core.errors import PluginError
 from mushpipe.core.paths import writes_within
 from mushpipe.core.settings import WORDS, settings_of
 from mushpipe.core.stage import Kind, Plugin, Sink, Source, Stage, kind_of
 from mushpipe.core.table_type import table_fault
-from mushpipe.core.tables import Columns
 from mushpipe.core.truth import BUILT_IN
 from mushpipe.core.types import Mask, RgbdFrame
 

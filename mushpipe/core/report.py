@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from mushpipe.core.columns import Columns
 from mushpipe.core.errors import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_OK, MushpipeError
-from mushpipe.core.tables import Columns
 from mushpipe.core.types import Header
 
 

@@ -7,7 +7,7 @@ from dataclasses import fields, is_dataclass
 
 import numpy as np
 
-from mushpipe.core.tables import Columns
+from mushpipe.core.columns import Columns
 from mushpipe.core.wire import JSON_KINDS
 
 _HEADER = ("timestamp", "sequence")

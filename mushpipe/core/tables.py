@@ -6,109 +6,20 @@ standing where the value is declared missing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass
 from enum import IntEnum, IntFlag
-from functools import cache, reduce
-from typing import Any, Self
+from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.arrays import Bools, Bytes, Floats, Ints, locked
+from mushpipe.core.arrays import Bools, Bytes, Floats, Ints
+from mushpipe.core.columns import Columns, column
 from mushpipe.core.geometry import axis_from_quaternion
 
 AXIS_TOLERANCE = 1e-3
 LARGEST_M = 1.0  # no mushroom is larger
 _EXACTLY = "must be finite exactly where its source is not MISSING"
-
-
-def _as_given(array: NDArray[Any], given: Any) -> bool:
-    """Return whether conversion has changed no value; NumPy cuts a fraction off without a word."""
-    return getattr(given, "dtype", None) == array.dtype or np.array_equal(array, given)
-
-
-def column(*shape: int, dtype: type = np.float64) -> Any:
-    """Declare a field of `Columns`: an array of shape (N, *shape) and the given dtype."""
-    return field(metadata={"shape": shape, "dtype": dtype})
-
-
-class Columns:
-    """Base of the per-mushroom types: every field made by `column` has the same length N.
-
-    Raises:
-        ValueError: A shape or length is wrong, a value is none of its dtype, or `check` objects.
-    """
-
-    def __post_init__(self) -> None:
-        length: int | None = None
-        for name, (shape, dtype) in self._columns().items():
-            given, where = getattr(self, name), f"{type(self).__name__}.{name}"
-            try:
-                array = locked(given, dtype)
-            except (TypeError, ValueError) as error:
-                raise ValueError(f"{where}: {error}") from error
-            if dtype.kind in "biu" and not _as_given(array, given):
-                raise ValueError(
-                    f"{where} is declared {dtype}, and was given what that cannot hold"
-                )
-            if array.shape == (0,):  # an empty list, of which nothing tells the shape of a row
-                array = array.reshape(0, *shape)
-            if array.shape[1:] != shape or array.ndim == 0:
-                expected = ", ".join(map(str, ("N", *shape))) + ("" if shape else ",")
-                raise ValueError(f"{where} has shape {array.shape}, expected ({expected})")
-            if length is not None and len(array) != length:
-                raise ValueError(f"{where} has {len(array)} rows, expected {length}")
-            length = len(array)
-            object.__setattr__(self, name, array)
-        self.check()
-
-    def check(self) -> None:
-        """Raise ValueError where values contradict each other; overridden by each type."""
-
-    @classmethod
-    @cache
-    def _columns(cls) -> dict[str, tuple[tuple[int, ...], np.dtype[Any]]]:
-        """Return the shape of a row and the dtype of each column."""
-        return {
-            item.name: (item.metadata["shape"], np.dtype(item.metadata["dtype"]))
-            for item in fields(cls)  # type: ignore[arg-type]
-            if "shape" in item.metadata
-        }
-
-    @classmethod
-    def unknown(cls, n: int, **known: Any) -> Self:
-        """Return n rows of which only the given fields are known: NaN, 0, False or "" elsewhere."""
-        blank = {}
-        for name, (shape, dtype) in cls._columns().items():
-            value = {"f": np.nan, "U": ""}.get(dtype.kind, 0)
-            blank[name] = np.full((n, *shape), value, dtype)
-        return cls(**{**blank, **known})
-
-    def take(self, rows: NDArray[Any]) -> Self:
-        """Return the given rows (indices or a mask), in that order."""
-        taken = {name: getattr(self, name)[rows] for name in self._columns()}
-        return replace(self, **taken)  # type: ignore[type-var]
-
-    def without(self, rows: Bools) -> Self:
-        """Return the same rows, of which those of a mask (N,) are unknown."""
-        if not rows.any():
-            return self
-        n = len(self)
-        return self.joined(type(self).unknown(1)).take(np.where(rows, n, np.arange(n)))
-
-    def joined(self, other: Self) -> Self:
-        """Return these rows, and behind them those of another."""
-        both = {n: np.concatenate([getattr(self, n), getattr(other, n)]) for n in self._columns()}
-        return replace(self, **both)  # type: ignore[type-var]
-
-    def __len__(self) -> int:
-        return len(getattr(self, next(iter(self._columns()))))
-
-    def _require(self, condition: Bools, text: str) -> None:
-        """Raise ValueError with the first row of which a condition (N, ...) does not hold."""
-        if not condition.all():
-            row = np.argwhere(~condition)[0, 0]
-            raise ValueError(f"{type(self).__name__}: {text} (row {row})")
 
 
 class DepthSource(IntEnum):
@@ -284,8 +195,7 @@ class Picks(Columns):
         return np.asarray(self.source == DepthSource.MISSING)
 
     def check(self) -> None:
-        """Ids are unique, and a pick without depth carries no position."""
-        self._require(first_of(self.id), "ids must be unique")
+        """A pick without depth carries no position, and says so."""
         self._require(self.source <= max(DepthSource), "the source must be a DepthSource")
         present = ~self.missing
         for name in ("position", "surface"):
@@ -293,3 +203,7 @@ class Picks(Columns):
             self._require(known == present, f"{name} {_EXACTLY}")
         flagged = (self.flags & PickFlag.DEPTH_MISSING) != 0
         self._require(flagged != present, "DEPTH_MISSING must be set exactly where missing")
+
+    def check_rows(self) -> None:
+        """Ids are unique."""
+        self._require(first_of(self.id), "ids must be unique")

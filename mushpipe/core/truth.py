@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.arrays import Bytes, Floats, Ints, locked
-from mushpipe.core.tables import Circles, Columns, Locations, Picks, Poses, column, first_of
+from mushpipe.core.columns import Columns, column
+from mushpipe.core.tables import Circles, Locations, Picks, Poses, first_of
 
 TRUTH_TOPIC = "/truth/mushrooms"
 INSTANCES_TOPIC = "/truth/instances"
@@ -60,13 +61,16 @@ class Truth(Columns):
     ignore: Bytes = column(dtype=np.uint8)
 
     def check(self) -> None:
-        """Ids are unique, outlines known, fractions within 0..1, axes of length 1."""
-        self._require(first_of(self.id), "ids must be unique")
+        """Outlines are known, fractions within 0..1, axes of length 1."""
         self._require(np.isfinite(self.center), "the centre must be finite")
         self._require((self.radius > 0) & np.isfinite(self.radius), "the radius must be positive")
         self._require(~((self.visible < 0) | (self.visible > 1)), "visible must be within 0..1")
         norm = np.linalg.norm(self.axis, axis=1)
         self._require(~(np.abs(norm - 1) > 1e-6), "axis must have length 1")
+
+    def check_rows(self) -> None:
+        """Ids are unique."""
+        self._require(first_of(self.id), "ids must be unique")
 
 
 BUILT_IN = (Circles, Locations, Poses, Picks, Truth)

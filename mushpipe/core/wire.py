@@ -15,8 +15,8 @@ import numpy as np
 import orjson
 
 from mushpipe.core.arrays import Bytes
+from mushpipe.core.columns import Columns
 from mushpipe.core.geometry import Camera
-from mushpipe.core.tables import Columns
 from mushpipe.core.truth import BUILT_IN, Instances, stands_for
 from mushpipe.core.types import Header, Mask, RgbdFrame
 

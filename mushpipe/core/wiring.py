@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Set
 from contextlib import suppress
 
+from mushpipe.core.columns import Columns
 from mushpipe.core.document import Document, Location
 from mushpipe.core.errors import MushpipeError, Problem, suggest
 from mushpipe.core.plan import Link, Node
 from mushpipe.core.plugins import Registry
 from mushpipe.core.ports import Port, ports_of
-from mushpipe.core.tables import Circles, Columns, Locations, Poses
+from mushpipe.core.tables import Circles, Locations, Poses
 from mushpipe.core.types import Trace
 
 _SHARE = "plugins share a type that they import from one package, or define in one file"

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.arrays import Bytes, Floats, Ints, Rows
-from mushpipe.core.tables import Columns, column
+from mushpipe.core.columns import Columns, column
 from mushpipe.core.types import Header
 from mushpipe.evaluate.matching import Matching, match
 from mushpipe.evaluate.results import Detections

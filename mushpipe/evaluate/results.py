@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from mushpipe.core.arrays import Bools, Floats
+from mushpipe.core.columns import Columns, column
 from mushpipe.core.errors import InputError, UsageError, suggest
 from mushpipe.core.recording import MANIFEST, SUMMARY, Index, Raw, RecordingReader
-from mushpipe.core.tables import Circles, Columns, PickFlag, Picks, column
+from mushpipe.core.tables import Circles, PickFlag, Picks
 from mushpipe.core.types import Header
 from mushpipe.core.wire import TIMING_TOPIC, TOTAL, decode_table
 from mushpipe.traces import stage_times, stated

@@ -15,10 +15,10 @@ import orjson
 from numpy.typing import NDArray
 
 from mushpipe.core.arrays import Bytes, Floats, Ints, Singles
+from mushpipe.core.columns import Columns, column
 from mushpipe.core.errors import InputError
 from mushpipe.core.geometry import Camera
 from mushpipe.core.libraries import import_realsense
-from mushpipe.core.tables import Columns, column
 from mushpipe.core.types import COLOR_FRAME, Header, RgbdFrame, end_of_scale
 from mushpipe.core.wire import Message
 from mushpipe.sources.images import decode_color

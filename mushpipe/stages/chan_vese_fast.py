@@ -204,6 +204,33 @@ def _solve_level(
     return u
 
 
+@jit
+def _length(u: Bytes) -> float:
+    """Return the length of a contour, px, as `contour_length` does."""
+    height, width = u.shape
+    axial = diagonal = 0
+    for y in range(height):
+        above, here = u[max(y - 1, 0)], u[y]
+        for x in range(width):
+            axial += here[x] ^ above[x]
+        for x in range(width - 1):
+            axial += here[x] ^ here[x + 1]
+            diagonal += (here[x] ^ above[x + 1]) + (here[x + 1] ^ above[x]) if y else 0
+    return math.pi / 8 * (axial + diagonal / math.sqrt(2))
+
+
+@jit
+def _cost(planes: Singles, u: Bytes, mu: float, c1: Floats, c2: Floats, known: bool) -> float:
+    """Return the energy of a region, times the pixels, less the squares of the image."""
+    _means(planes, u, c1, c2, known)
+    fit = 0.0
+    for k in range(len(planes)):
+        inside, total, everything = region_sums(planes[k], u)
+        fit += c1[k] * (inside * c1[k] - 2 * total)
+        fit += c2[k] * ((u.size - inside) * c2[k] - 2 * (everything - total))
+    return fit / len(planes) + mu * _length(u)
+
+
 def solve_fast(
     image: Singles,
     initial: Bools,
@@ -236,7 +263,8 @@ def _pyramid(
     """Solve at half resolution first, with mu / 2: the length halves while the area quarters.
 
     What is small is nothing at a coarse level. Where no contour is left there this level begins
-    with its own; where none is left here the descent alone decides, which never goes up.
+    with its own; where none is left here, or one that costs more than the first, the descent alone
+    decides, which never goes up.
     """
     height, width = initial.shape
     if depth > 1 and min(height, width) >= 32:
@@ -251,8 +279,10 @@ def _pyramid(
     c1, c2 = (np.full(len(planes), level) for level in levels or (0.0, 0.0))
     known = levels is not None
     u = _solve_level(planes, u, mu, c1, c2, known, (iterations, sweeps))
-    if not _divides(u):
-        u = _solve_level(planes, initial.copy(), mu, c1, c2, known, (0, sweeps))
+    own = initial.copy()
+    worse = _cost(planes, u, mu, c1, c2, known) > _cost(planes, own, mu, c1, c2, known)
+    if worse or not _divides(u):
+        u = _solve_level(planes, own, mu, c1, c2, known, (0, sweeps))
     return np.asarray(u, np.uint8)
 
 

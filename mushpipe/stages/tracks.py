@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mushpipe.core.arrays import Bools, Floats, Ints, Rows
-from mushpipe.core.tables import Circles, Columns, Locations, column
+from mushpipe.core.columns import Columns, column
+from mushpipe.core.tables import Circles, Locations
 from mushpipe.stages.pairs import assigned, distances
 
 GATE = 0.5  # farthest that a mushroom may be from where it is expected, in radii
@@ -131,7 +132,8 @@ def _assign(apart: Floats, resized: Floats) -> tuple[Rows, Rows]:
     """Return the rows and columns of the pairs: as many as there can be, as near as can be."""
     n, m = apart.shape
     cost = np.full((n, m + n), np.inf)
-    cost[:, :m] = np.where(apart <= 1, np.hypot(apart, resized), np.inf)
+    near = apart <= 1
+    cost[:, :m][near] = np.hypot(apart[near], resized[near])
     np.fill_diagonal(cost[:, m:], 1e6)  # to stay alone: more than any number of pairs
     columns = assigned(cost)
     rows = np.flatnonzero(columns < m)

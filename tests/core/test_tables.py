@@ -228,6 +228,29 @@ def test_rows_are_taken_in_the_order_asked_for():
     assert len(picks().take(np.array([False, False]))) == 0
 
 
+def test_rows_taken_or_joined_are_locked_and_no_id_comes_twice():
+    taken = picks().take(np.array([0]))
+    assert not taken.center.flags.writeable
+    with pytest.raises(ValueError, match="Picks: ids must be unique"):
+        picks().take(np.array([0, 0]))
+    with pytest.raises(ValueError, match="Picks: ids must be unique"):
+        taken.joined(taken)
+
+
+def test_what_a_type_of_ones_own_derives_follows_the_rows():
+    @dataclass(frozen=True, eq=False)
+    class Weights(Columns):
+        grams: np.ndarray = column()
+
+        def __post_init__(self):
+            super().__post_init__()
+            object.__setattr__(self, "total", self.grams.sum())
+
+    weights = Weights(np.array([1.0, 2.0, 4.0]))
+    assert weights.take(np.array([0, 2])).total == 5
+    assert weights.joined(weights).total == 14
+
+
 def test_columns_of_ones_own():
     @dataclass(frozen=True, eq=False)
     class Sizes(Columns):

@@ -19,13 +19,13 @@ from mcap.writer import Writer
 
 from mushpipe import Camera, Circles, DepthSource, Header, Locations, Picks, Poses, RgbdFrame
 from mushpipe.core import wire
+from mushpipe.core.columns import Columns
 from mushpipe.core.document import Document
 from mushpipe.core.graph import compile_document
 from mushpipe.core.plugins import load_registry
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.recording import MANIFEST, RecordingReader
 from mushpipe.core.run import run
-from mushpipe.core.tables import Columns
 from mushpipe.core.truth import Truth
 from mushpipe.core.wire import decode_table
 from mushpipe.sources.mcap import McapSource

@@ -3,7 +3,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from benchmarks.graph_cut import graph_cut
@@ -152,14 +152,15 @@ def test_a_small_cap_alone_in_view_is_not_lost(radius: int) -> None:
     contrast=st.floats(0.2, 0.8),
     mu=st.sampled_from([0.005, 0.02, 0.1]),
 )
+@example(caps=[(0.0, 1.0, 7.0)], contrast=0.21875, mu=0.02)  # the pyramid ends beside the minimum
 @settings(max_examples=60, deadline=None)
-def test_no_mask_of_discs_costs_more_than_the_start_but_for_hundredths(
+def test_no_mask_of_discs_costs_more_than_the_start(
     caps: list[tuple[float, float, float]], contrast: float, mu: float
 ) -> None:
     image = discs(caps, 0.1 + contrast, 0.1).astype(np.float32)
     start = otsu_foreground(image)
     limit = chan_vese_energy(image, start, mu)
-    assert chan_vese_energy(image, solve_fast(image, start, mu), mu) <= 1.02 * limit
+    assert chan_vese_energy(image, solve_fast(image, start, mu), mu) <= (1 + 1e-5) * limit
 
 
 def test_known_levels_are_kept() -> None:

@@ -38,9 +38,10 @@ def overlap_features(shape: Floats, accepted: Floats, row: Floats) -> None:
     row[4] = row[5] = row[6] = 0
     own = math.pi * shape[2] ** 2
     for other in accepted:
-        d = math.hypot(other[0] - shape[0], other[1] - shape[1])
-        if d >= other[2] + shape[2]:
+        squared = (other[0] - shape[0]) ** 2 + (other[1] - shape[1]) ** 2
+        if squared >= (other[2] + shape[2]) ** 2:
             continue
+        d = math.sqrt(squared)
         shared, area = lens(d, shape[2], other[2]), math.pi * other[2] ** 2
         row[4] = max(row[4], shared / own)
         row[5] = max(row[5], shared / area)
@@ -147,7 +148,7 @@ def _use_up(edges: Strips, shape: Floats, number: int, owner: Ints32, scratch: S
     near = max(TAKEN, 1.3 * tolerance(shape[2]))
     for k in range(count):
         dx, dy = edges.x[rows[k]] - shape[0], edges.y[rows[k]] - shape[1]
-        d = max(1e-6, math.hypot(dx, dy))
+        d = max(1e-6, math.sqrt(dx * dx + dy * dy))
         c, s = dx / d, dy / d
         e = d - (shape[2] + shape[3] * (c * c - s * s) + shape[4] * 2 * s * c)
         if abs(e) < near and owner[rows[k]] < 0:

@@ -125,8 +125,10 @@ def _bare(center: Floats, of: Floats, shapes: Floats, radius: Floats, taken: Boo
     for m in range(len(center)):
         own = math.pi * of[m] ** 2
         for k in range(len(shapes)):
-            away = math.hypot(shapes[k, 0] - center[m, 0], shapes[k, 1] - center[m, 1])
-            if away < radius[k] + of[m]:
+            dx, dy = shapes[k, 0] - center[m, 0], shapes[k, 1] - center[m, 1]
+            squared = dx * dx + dy * dy
+            if squared < (radius[k] + of[m]) ** 2:
+                away = math.sqrt(squared)
                 covered = taken[k] and lens(away, of[m], radius[k]) > _OWN * own
                 if covered or iou(away, of[m], radius[k]) >= _SAME:
                     free[m] = False
