@@ -184,7 +184,7 @@ def _check_outputs(node: Node, values: tuple[Any, ...], frame: RgbdFrame) -> Non
         raise TypeError(
             f"it returned ({', '.join(type(v).__name__ for v in values)}), "
             f"declared is ({', '.join(t.__name__ for t in expected)})"
-            + ("; is a `return` missing?" if values == (None,) else "")
+            + ("; is a `return` missing?" if len(values) == 1 and values[0] is None else "")
         )
     height, width = frame.color.shape[:2]
     for value in values:

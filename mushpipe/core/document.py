@@ -48,10 +48,12 @@ class Document:
 
     def problem(self, at: Location, message: str, hint: str = "", key: bool = False) -> Problem:
         """Place a message at a location, or at the nearest place above it that is in the file."""
-        of_node = at == ("source",) or (len(at) == 2 and at[0] in ("stages", "sinks"))
-        if of_node and at not in self.overrides:  # which the command line may have changed
-            labels = dict.fromkeys(t for key, t in self.overrides.items() if key[:-1] == at)
-            message += f" (with {', '.join(labels)})" if labels else ""
+        node = at[: 2 if at[:1] in (("stages",), ("sinks",)) else 1]
+        if node and at not in self.overrides:  # the command line may be what it does not go with
+            below = {key: label for key, label in self.overrides.items() if key[:-1] == node}
+            at_fault = (label for key, label in below.items() if at == node or key[-1] == "use")
+            labels = ", ".join(dict.fromkeys(at_fault))
+            message += f" (with {labels})" if labels else ""
         for end in range(len(at), -1, -1):
             if at[:end] in self.overrides:
                 return Problem(self.overrides[at[:end]], 0, 0, message, hint)

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Union, get_args, get_origin
 
-from pydantic import AfterValidator, BaseModel, ValidationInfo
+from pydantic import AfterValidator, BaseModel, PlainSerializer, ValidationInfo
 from pydantic.fields import FieldInfo
 
 from mushpipe.core.errors import UsageError
@@ -44,13 +44,23 @@ def resolve_path(path: Path, info: ValidationInfo) -> Path:
     path = from_home(path)
     context = info.context or {}
     from_shell = info.field_name in context.get("from_shell", ())
-    whole = Path("" if from_shell else context.get("base", "")) / path
-    short = Path(os.path.normpath(whole))
+    return _shortened(Path("" if from_shell else context.get("base", "")) / path)
+
+
+def _shortened(path: Path) -> Path:
+    short = Path(os.path.normpath(path))
     # ".." behind a link is beside what it leads to
-    return short if real(short) == real(whole) else whole
+    return short if real(short) == real(path) else path
 
 
-GraphPath = Annotated[Path, AfterValidator(resolve_path)]
+def written_path(path: Path) -> str:
+    """Return a path as manifests hold it, from which a run is repeated in any folder."""
+    return str(path if path == STDIO else _shortened(path.absolute()))
+
+
+GraphPath = Annotated[
+    Path, AfterValidator(resolve_path), PlainSerializer(written_path, str, when_used="json")
+]
 """A path setting: relative to the graph file, or to the shell where the command line set it."""
 
 

@@ -118,6 +118,10 @@ def test_record_then_replay_by_source_with_paths_relative_to_the_shell(folder: P
     assert done.returncode == 0, done.stderr
     assert (folder / "elsewhere/here.mcap").exists()
     assert not (folder / "out.mcap").exists()
+    graph = json.loads((folder / "elsewhere/here.mcap.run.json").read_text())["graph"]
+    (folder / "again.yaml").write_text(json.dumps(graph))
+    done = mushpipe("run", "again.yaml", cwd=folder)
+    assert done.returncode == 0, done.stderr
 
 
 def test_faults_of_a_graph_are_printed_together_with_places(folder: Path) -> None:

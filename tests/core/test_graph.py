@@ -361,6 +361,9 @@ def test_a_fault_of_a_plugin_that_the_command_line_chose_says_so(lab: Lab):
     faults = lab.faults(lab.chain("threshold"), "a.use=blind")
     assert "produces the Circles of its 'other' (with --set a.use=blind)" in faults
 
+    faults = lab.faults(lab.chain("needy, size: large"), "a.use=threshold", "a.use=needy")
+    assert 'got "large" (with --set a.use=needy)' in faults
+
 
 def test_a_missing_setting_is_placed_at_its_plugin(lab: Lab):
     class Needy(Sink):

@@ -207,6 +207,11 @@ class ReturnsTwo(Stage):
         return Mask(frame.gray > 0), circles(1)
 
 
+class ReturnsArray(Stage):
+    def process(self, frame: RgbdFrame) -> Mask:
+        return frame.gray > 0
+
+
 class Crop(Stage):
     def process(self, frame: RgbdFrame) -> RgbdFrame:
         return RgbdFrame(frame.header, frame.color[:, :4])
@@ -230,6 +235,10 @@ FAILURES = {
     "returns nothing": (
         Forgets,
         "TypeError: it returned (NoneType), declared is (Mask); is a `return` missing?",
+    ),
+    "returns an array": (
+        ReturnsArray,
+        "TypeError: it returned (ndarray), declared is (Mask)",
     ),
     "returns another order": (
         ReturnsAnother,
