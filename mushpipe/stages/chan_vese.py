@@ -67,7 +67,11 @@ class ChanVese(Stage):
             return Mask(initial, initial)
         if found.floor and image.ndim == 2:  # two phases, not bed, mycelium and caps
             image = np.maximum(image, np.float32(found.floor))
-        return Mask(self.solve(image, initial), initial)
+        region = self.solve(image, initial)
+        if self.channel == "gray+height" and image.ndim == 3:
+            # Where hardly anything stands out, the relief of the soil would be the two sides.
+            region &= initial | (image[..., 1] >= 0.5)
+        return Mask(region, initial)
 
     def solve(self, image: Singles, initial: Bools) -> Bools:
         """Evolve a region of an image in 0..1 with the chosen solver."""

@@ -81,6 +81,13 @@ def test_an_empty_bed_is_empty(stage: Segmenter, light: str) -> None:
     assert found.mean() < 0.004
 
 
+@pytest.mark.parametrize("seed", [7100, 7200])
+def test_the_relief_of_soil_alone_has_no_two_sides(seed: int) -> None:
+    bed = {"width": 640, "height": 480, "count": 0, "pins": 0, "stumps": 0, "mycelium": 0}
+    found = ChanVese(channel="gray+height").process(simulated(seed, **bed)).foreground
+    assert found.mean() < 0.015  # bright crumbs; it was a sixth of the picture
+
+
 @pytest.mark.parametrize("stage", CHECKED, ids=str)
 def test_noise_in_colour_is_empty(stage: Segmenter) -> None:
     color = np.random.default_rng(1).normal(90, 12, (240, 320, 3))
