@@ -41,6 +41,7 @@ def describe(path: Path) -> dict[str, Any]:
         "attachments": index.attachments,
         "results_of": index.metadata.get(MANIFEST, {}).get("json", ""),
         "damage": reader.damage,
+        "unchecked": reader.unchecked,
     }
 
 
@@ -51,6 +52,8 @@ def render(content: dict[str, Any]) -> str:
         *_columns([(t["topic"], t["schema"], str(t["messages"])) for t in content["topics"]]),
     ]
     lines += [f"attachment {name}" for name in content["attachments"]]
+    if content["unchecked"]:
+        lines.append("without checksums: bytes that changed since it was recorded show nowhere")
     lines += [f"damaged: {text}" for text in content["damage"]]
     return "\n".join(lines)
 

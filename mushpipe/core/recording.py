@@ -6,7 +6,6 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -109,7 +108,8 @@ class RecordingReader:
     """Reads an MCAP file from front to back, chunk by chunk, checking the CRC of each.
 
     Messages come in file order, sorted by log time within a chunk, and from chunk to chunk where
-    these lie side by side in time. ``damage`` says afterwards, in words, what could not be read.
+    these lie side by side in time. Afterwards ``damage`` says, in words, what could not be read,
+    and ``unchecked`` whether a chunk had no CRC: bytes that changed in it show nowhere.
 
     Raises:
         UsageError: There is no such file, or it is a pipe.
@@ -119,6 +119,7 @@ class RecordingReader:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.damage: list[str] = []
+        self.unchecked = False
         self._index: Index | None = None
         try:
             # what was read of a pipe is gone: the rest would pass for a damaged file
@@ -220,6 +221,7 @@ class RecordingReader:
             self._note(f"a chunk is not where its index says ({error})")
 
     def _unpack(self, chunk: Chunk, as_written: bool = False) -> list[McapRecord]:
+        self.unchecked |= chunk.uncompressed_crc == 0  # by MCAP's specification, none is known
         try:
             if chunk.uncompressed_size > 2**32:
                 raise ValueError("implausible size")
@@ -230,9 +232,7 @@ class RecordingReader:
         if as_written:
             return records
         # Only messages move, and all to the end: a channel is always known before its messages.
-        messages = [r for r in records if isinstance(r, McapMessage)]
-        others = [r for r in records if not isinstance(r, McapMessage)]
-        return [*others, *sorted(messages, key=attrgetter("log_time"))]
+        return sorted(records, key=lambda r: r.log_time if isinstance(r, McapMessage) else -1)
 
     def contents(self) -> str:
         """Return its topics as text, for messages, and what of it could not be read."""
