@@ -39,7 +39,7 @@ def failure(node: Node, sequence: int | None, error: BaseException, method: str 
         text += "; frames and tables belong to all stages: copy an array before changing it"
     code = error.exit_code if isinstance(error, MushpipeError) else 1
     if sequence is None and not known:  # else a capsule is kept, and -v told of beside it
-        text += " (-v says where)"
+        text += " (run -v says where)"
     if not known:
         logger.debug("where %s '%s' failed:", node.kind, node.name, exc_info=error)
     return StageError(f"{node.kind} '{node.name}' ({node.use}) failed{at}: {text}", code)

@@ -32,7 +32,9 @@ def test_what_failed_to_open_is_closed_too_and_nothing_runs(lab: Lab, where, cal
     seen: list[str] = []
     report = lab.run(recorded(lab, seen, f"open {where}"))
     assert seen == calls
-    assert str(report.error).endswith(f"failed in open(): OSError: open {where} (-v says where)")
+    assert str(report.error).endswith(
+        f"failed in open(): OSError: open {where} (run -v says where)"
+    )
     assert (report.exit_code, report.processed) == (1, 0)
 
 
@@ -60,13 +62,15 @@ def test_a_close_that_fails_stops_no_other(lab: Lab, where):
     seen: list[str] = []
     report = lab.run(recorded(lab, seen, f"close {where}"))
     assert seen[-3:] == ["close sink", "close stage", "close source"]
-    assert str(report.error).endswith(f"failed in close(): OSError: close {where} (-v says where)")
+    assert str(report.error).endswith(
+        f"failed in close(): OSError: close {where} (run -v says where)"
+    )
     assert (report.exit_code, report.processed) == (1, 3)
 
 
 def test_a_sink_that_fails_to_finish(lab: Lab):
     report = lab.run(recorded(lab, [], "finish sink"))
-    text = "sink 'out' (rec-sink) failed in finish(): OSError: finish sink (-v says where)"
+    text = "sink 'out' (rec-sink) failed in finish(): OSError: finish sink (run -v says where)"
     assert str(report.error) == text
 
 
@@ -154,7 +158,7 @@ def test_a_damaged_recording_ends_with_4_after_all_good_frames(lab: Lab):
 def test_a_source_that_fails_is_named(lab: Lab, error):
     report = lab.run(source_that(lab, lambda: good_then(error)))
     reason = f"{type(error).__name__}: {error}"
-    assert str(report.error) == f"source 'source' (own) failed: {reason} (-v says where)"
+    assert str(report.error) == f"source 'source' (own) failed: {reason} (run -v says where)"
     assert (report.processed, report.exit_code) == (2, 1)
 
 
@@ -185,7 +189,7 @@ def test_a_source_that_fails_to_close_does_not_hang(lab: Lab):
             raise OSError("stuck")
 
     report = lab.run(source_that(lab, frames), "source.max_frames=1")
-    assert str(report.error) == "source 'source' (own) failed: OSError: stuck (-v says where)"
+    assert str(report.error) == "source 'source' (own) failed: OSError: stuck (run -v says where)"
     assert report.processed == 1
 
 
@@ -196,7 +200,7 @@ def test_a_source_that_cannot_describe_itself(lab: Lab, method):
 
     lab.registry.source("vague", type("Vague", (Frames,), {method: fails}))
     report = lab.run(lab.chain("threshold", source="vague"))
-    text = f"source 'source' (vague) failed in {method}(): OSError: no idea (-v says where)"
+    text = f"source 'source' (vague) failed in {method}(): OSError: no idea (run -v says where)"
     assert str(report.error) == text
 
 

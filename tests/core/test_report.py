@@ -258,7 +258,7 @@ def test_a_source_that_does_not_name_what_it_plays_is_told_of(lab: Lab, graph: s
         manifest_path(plan)
     assert str(execute(plan, None, None).error) == text
     plan = lab.compile(graph.replace("recorded", "unmounted"))
-    text = "source 'source' (unmounted) failed in name(): OSError: not mounted (-v says where)"
+    text = "source 'source' (unmounted) failed in name(): OSError: not mounted (run -v says where)"
     with pytest.raises(StageError, match=re.escape(text)):
         manifest_path(plan)
     assert str(execute(plan, None, None).error) == text
@@ -271,6 +271,6 @@ def test_a_source_that_cannot_name_its_files_is_told_of(lab: Lab, graph: str, ca
         execute(lab.compile(graph.replace("recorded", "unmounted")), None, None)
     assert (
         str(caught.value)
-        == "source 'source' (unmounted) failed in files(): OSError: not mounted (-v says where)"
+        == "source 'source' (unmounted) failed in files(): OSError: not mounted (run -v says where)"
     )
     assert "where source 'source' failed" in caplog.text

@@ -66,7 +66,7 @@ def test_a_source_that_fails_at_the_end_costs_no_sink_its_frames(lab: Lab, metho
 
     lab.registry.source("going", type("Going", (Frames,), {method: gone}))
     report = lab.run(lab.chain("threshold", source="going"))
-    text = f"source 'source' (going) failed in {method}(): OSError: device gone (-v says where)"
+    text = f"source 'source' (going) failed in {method}(): OSError: device gone (run -v says where)"
     assert str(report.error) == text
     assert counts(report) == (3, 3, 0, 0)
     assert [trace.frame.header.sequence for trace in lab.seen] == [0, 1, 2]
@@ -270,7 +270,7 @@ def test_a_stage_that_leaves_as_a_program_does_fails(lab: Lab, method: str):
     """With 0, as scripts end, nothing was run and the program ended as if all were fine."""
     leaving = {method: lambda self: sys.exit(0)}
     report = lab.run(lab.chain(type("Leaves", (Both,), leaving)))
-    text = f"stage 'a' (own-a) failed in {method}(): SystemExit: 0 (-v says where)"
+    text = f"stage 'a' (own-a) failed in {method}(): SystemExit: 0 (run -v says where)"
     assert str(report.error) == text
     assert report.exit_code == 1
 
