@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mushpipe.core.arrays import Bools, Floats
+from mushpipe.core.arrays import Bools, Floats, Singles
 from mushpipe.core.errors import UsageError
 from mushpipe.core.tables import Circles, Locations
 from mushpipe.core.types import Mask, RgbdFrame, Trace
@@ -67,11 +67,10 @@ def draw_localization(trace: Trace) -> Figure:
     """
     circles, locations = _located(trace)
     frame = trace.frame
-    if frame.depth is None:
-        raise UsageError(f"frame {frame.header.sequence} has no depth to draw")
-    height, width = frame.depth.shape
+    depth_m = _depth_m(frame)
+    height, width = depth_m.shape
     u, v = np.rint(circles.center).astype(int).T
-    depth = frame.depth_m[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)].astype(np.float64)
+    depth = depth_m[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)].astype(np.float64)
     distance = np.full(len(circles), np.nan)
     if frame.camera is not None:
         points = frame.camera.deproject(circles.center, depth)
@@ -111,7 +110,8 @@ def draw_pose(trace: Trace, settings: Mapping[str, Any]) -> Figure:
         settings: Of the stage `registration`, which is run anew on the best circles.
 
     Raises:
-        UsageError: The frame has no circles, no locations, or no mushroom with enough depth.
+        UsageError: The frame has no depth, no circles, no locations, or no mushroom with enough
+            depth.
         DependencyError: open3d or a library of the system is missing.
     """
     from mushpipe.stages.registration import Registration
@@ -121,6 +121,7 @@ def draw_pose(trace: Trace, settings: Mapping[str, Any]) -> Figure:
     best = np.argsort(-circles.score, kind="stable")
     # the frame that the stage got, where the recording has it: its depth may have been corrected
     frame = ([trace.frame] + [value for _, value in trace.of(RgbdFrame)])[-1]
+    _depth_m(frame)
     tries = (stage.align(frame, circles, locations, int(row), 0) for row in best)
     pairs = zip(best, tries, strict=True)
     found = list(islice((pair for pair in pairs if pair[1] is not None), POSES))
@@ -145,6 +146,12 @@ def _last(trace: Trace, kind: type[T]) -> T:
             "(mushpipe info tells)"
         )
     return found[-1]
+
+
+def _depth_m(frame: RgbdFrame) -> Singles:
+    if frame.depth is None:
+        raise UsageError(f"frame {frame.header.sequence} has no depth to draw")
+    return frame.depth_m
 
 
 def _located(trace: Trace) -> tuple[Circles, Locations]:

@@ -177,9 +177,12 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
     trace = trace_of(make_frame(0))
     with pytest.raises(UsageError, match="frame 10 has no Circles"):
         draw_stages(trace)
-    colour_only = Trace(make_frame(0, depth=None), scene().outputs, {})
+    results = {name: scene().outputs[name] for name in ("detect", "locate")}
+    colour_only = trace_of(make_frame(0, depth=None, camera=None), **results)
     with pytest.raises(UsageError, match="frame 10 has no depth"):
         draw_localization(colour_only)
+    with pytest.raises(UsageError, match="frame 10 has no depth"):
+        draw_pose(colour_only, {})
 
 
 def test_the_command_writes_an_image(tmp_path: Path) -> None:
