@@ -28,16 +28,19 @@ from typing import Any, cast
 import numpy as np
 
 from mushpipe import Header, Picks, RgbdFrame, RunInfo, Trace
+from mushpipe.core.geometry import quaternion_from_axis
+from mushpipe.robot.targets import Filter
 from mushpipe.sinks.robot_json import RobotJsonSink
 
 HELLO = b'{"op":"hello","version":"1.0","mode":"stream"}\n'
 LATE_HEARTBEAT_S = 1.5
+RECEIVE_BUFFER = 1 << 16
 
 
 def random_picks(count: int, rng: np.random.Generator) -> Picks:
     """Return picks with every field set, as a pipeline with poses makes them."""
     axis = rng.normal(size=(count, 3)) * 0.2 + [0, 0, -1]
-    quaternion = rng.normal(size=(count, 4))
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     return Picks(
         id=np.arange(count),
         center=rng.uniform(0, 480, (count, 2)),
@@ -46,8 +49,8 @@ def random_picks(count: int, rng: np.random.Generator) -> Picks:
         surface=rng.uniform(-0.2, 0.5, (count, 3)),
         distance=rng.uniform(0.4, 0.5, count),
         diameter=rng.uniform(0.02, 0.06, count),
-        quaternion=quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True),
-        axis=axis / np.linalg.norm(axis, axis=1, keepdims=True),
+        quaternion=quaternion_from_axis(axis),
+        axis=axis,
         score=rng.uniform(0, 1, count),
         sigma_position=rng.uniform(0, 0.002, (count, 3)),
         sigma_diameter=rng.uniform(0, 0.002, count),
@@ -102,11 +105,14 @@ class Stuck(threading.Thread):
     def run(self) -> None:
         """Be stuck until told to end."""
         while not self.done.is_set():
-            with socket.create_connection(("127.0.0.1", self.port)) as sock:
+            with socket.socket() as sock:
+                # else the kernel reads in its place, for seconds
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+                sock.connect(("127.0.0.1", self.port))
                 sock.sendall(HELLO)
                 self.connections += 1
                 poll = select.poll()
-                poll.register(sock, 0)
+                poll.register(sock, select.POLLRDHUP)
                 while not self.done.is_set() and not poll.poll(200):
                     pass
 
@@ -118,6 +124,7 @@ def serve(arguments: argparse.Namespace, folder: str) -> dict[str, Any]:
     )
     rng = np.random.default_rng(0)
     picks = [random_picks(arguments.targets, rng) for _ in range(8)]
+    assert all(len(Filter()(each).targets) == arguments.targets for each in picks)  # none withheld
     handed: dict[int, float] = {}
     consumed: list[float] = []
     sink.open(RunInfo("benchmark", {}, live=True, frames_read=lambda: len(handed)))

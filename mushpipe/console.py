@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -28,6 +29,7 @@ from mushpipe.core.run import run
 
 # Names may hold brackets, which are no markup.
 stderr = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
+WINDOW_S = 2.0  # over which the rate is shown
 NOT_AGAIN = (
     "this frame does not fail again: the plugin was changed since, or what failed depends on the "
     "frames before it, or on something outside of the graph"
@@ -83,6 +85,24 @@ def interruptible(stop: threading.Event) -> Iterator[None]:
             signal.signal(number, handler)
 
 
+class Rate:
+    """How many frames a second there are now: a mean of the whole run hides that a camera slows."""
+
+    def __init__(self) -> None:
+        self._counts: deque[tuple[float, int]] = deque()
+
+    def at(self, now_s: float, count: int) -> float:
+        """Take in how many there were at a moment; return the rate of the last `WINDOW_S`.
+
+        It is 0 at the first, and goes back to the count before where that is older.
+        """
+        self._counts.append((now_s, count))
+        while len(self._counts) > 2 and now_s - self._counts[1][0] >= WINDOW_S:
+            self._counts.popleft()
+        begin_s, before = self._counts[0]
+        return (count - before) / (now_s - begin_s) if now_s > begin_s else 0.0
+
+
 @contextmanager
 def progress_bar(size: Callable[[], int] | None = None) -> Iterator[Any]:
     """Yield a function that shows a `RunReport`; it shows nothing where stderr is no terminal.
@@ -99,11 +119,11 @@ def progress_bar(size: Callable[[], int] | None = None) -> Iterator[Any]:
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     with Progress(*columns, console=stderr, transient=True) as bar:
         task = bar.add_task("preparing; the first run of all compiles", total=None)
-        started = time.monotonic()
+        rate = Rate()
 
         def show(report: RunReport) -> None:
-            rate = report.processed / max(time.monotonic() - started, 1e-9)
-            text = f"{report.processed} frames  {rate:.1f} fps  {report.dropped} dropped"
+            fps = rate.at(time.monotonic(), report.processed)
+            text = f"{report.processed} frames  {fps:.1f} fps  {report.dropped} dropped"
             text += f"  {size() / 1e6:.1f} MB" if size else ""
             bar.update(task, description=text)
 

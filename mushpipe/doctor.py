@@ -90,14 +90,19 @@ def _python() -> Iterator[Finding]:
 
 def _libraries() -> Iterator[Finding]:
     from mushpipe.core.errors import DependencyError
-    from mushpipe.core.libraries import import_open3d, import_realsense
+    from mushpipe.core.libraries import import_onnxruntime, import_open3d, import_realsense
 
+    native = {
+        "open3d": import_open3d,
+        "onnxruntime": import_onnxruntime,
+        "pyrealsense2": import_realsense,
+    }
     for name in _PACKAGES:
         try:
             yield Finding(name, State.ok, version(name))
         except PackageNotFoundError:
             yield Finding(name, State.error, "is not installed", f"pip install {name}")
-    for name, load in (("open3d", import_open3d), ("pyrealsense2", import_realsense)):
+    for name, load in native.items():
         try:
             module = load()
         except DependencyError as error:

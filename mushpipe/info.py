@@ -113,7 +113,8 @@ def describe_plugin(registry: Registry, name: str) -> str:
     found = [_describe_class(kind, name, plugin) for kind, plugin in classes]
     if not found:
         known = sorted({n for kind in KINDS for n in registry.names(kind)})
-        raise PluginError(f"there is no plugin '{name}'; {suggest(name, known)}")
+        text = f"there is no plugin '{name}'; {suggest(name, known)}"
+        raise PluginError(text + registry.not_loaded())
     return "\n\n".join(found)
 
 

@@ -65,6 +65,8 @@ def record(
 
     set_up_logging(False)
     limits = source_overrides(frames=frames, duration=duration)
+    if duration is not None and frames is None:  # a source's own number of frames would end it
+        limits = [("source.max_frames=null", f"--duration {duration}"), *limits]
     # The sink looks once more: opening a camera takes time, in which another may have recorded it.
     settings = {"path": str(out), "timing": False, "overwrite": False}
     settings |= {"jpeg_quality": JPEG_QUALITY} if colour is Colour.jpeg else {}

@@ -36,6 +36,10 @@ def figure(
     out: Annotated[Path, typer.Option("--out", "-o", help="image to write: .png .jpg .pdf .svg")],
     kind: Annotated[FigureKind, typer.Option(help="which figure")] = FigureKind.stages,
     frame: Annotated[int, typer.Option(help="number of the frame")] = 0,
+    id_: Annotated[
+        int | None,
+        typer.Option("--id", help="mushroom of a pose: its pick's id; without picks its row"),
+    ] = None,
 ) -> None:
     """Draw a figure of the paper from a frame of a result recording."""
     from mushpipe.console import set_up_logging
@@ -47,6 +51,8 @@ def figure(
     set_up_logging(False)
     if not out.suffix:  # matplotlib would write another file, out.png
         raise UsageError(f"{out}: expected the kind of image in its name: {out}.png, say")
+    if id_ is not None and kind is not FigureKind.pose:
+        raise UsageError(f"--id {id_}: only --kind pose draws one mushroom, {kind} draws all")
     spare(out, results)
     require_writable(out)
     trace = read_trace(results, frame)
@@ -55,7 +61,7 @@ def figure(
         stages = graph.get("stages", {}).values()
         stages = [s for s in stages if s["use"].rpartition(":")[2] == "registration"]
         settings = {k: v for s in stages[-1:] for k, v in s.items() if k not in ("use", "inputs")}
-        drawn = draw_pose(trace, settings)
+        drawn = draw_pose(trace, settings, id_)
     else:
         drawn = KINDS[kind](trace)
     try:

@@ -157,14 +157,17 @@ class Registry:
         for other in ("stage", "source", "sink"):
             if (other, use) in self.entries:
                 text = f"'{use}' is a {other}, not a {kind}"
+        return text + self.not_loaded()
+
+    def not_loaded(self) -> str:
+        """Return lines on why a name may be unknown: packages that failed or were left out."""
+        lines = [
+            f"it may belong to {b.distribution} {b.version}, which failed to load: {b.reason}"
+            for b in self.broken
+        ]
         if (narrowed := os.environ.get("MUSHPIPE_PLUGINS")) is not None:  # "" leaves out all
-            text += f"\n    only plugins of MUSHPIPE_PLUGINS={narrowed} are loaded"
-        for broken in self.broken:
-            text += (
-                f"\n    it may belong to {broken.distribution} {broken.version}, "
-                f"which failed to load: {broken.reason}"
-            )
-        return text
+            lines = [f"only plugins of MUSHPIPE_PLUGINS={narrowed} are loaded", *lines]
+        return "".join(f"\n    {line}" for line in lines)
 
 
 def load_registry() -> Registry:

@@ -48,6 +48,7 @@ _OTHERS = {
     b"SQLite f": f"a ROS 2 bag in SQLite: {CONVERT.format('ITS_FOLDER')} makes MCAP of it",
     b"#ROSBAG ": f"a bag of ROS 1: {CONVERT.format('FILE')} makes MCAP of it; one of Intel's "
     "viewer is played where its name ends with .bag",
+    b"RRF": "a Rerun file: open it with 'rerun FILE'",
     ZSTD: "compressed as a whole: 'zstd -d FILE' unpacks it",
     **dict.fromkeys(
         (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"),

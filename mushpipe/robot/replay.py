@@ -12,7 +12,7 @@ from typing import Any
 
 import orjson
 
-from mushpipe.core.errors import InputError
+from mushpipe.core.errors import InputError, UsageError
 from mushpipe.robot.transcript import Line, read_transcript
 
 Show = Callable[[str, bytes], None]
@@ -30,18 +30,20 @@ def lines_of(path: Path, client: int | None = None) -> tuple[list[Line], list[st
     And, in words, what of the file is damaged.
 
     Raises:
-        InputError: There is no such client.
+        InputError: No client said anything.
+        UsageError: There is no such client.
     """
     everything, damage = read_transcript(path)
     said = [line for line in everything if line.kind != "event"]
     if client is None:
         client = next((line.client for line in said if line.kind == "rx"), None)
     found = [line for line in said if line.client == client]
+    if not found and client is None:
+        raise InputError(f"{path}: no client said anything; choose one with --client")
     if not found:
-        raise InputError(
-            f"{path}: no client said anything; choose one with --client"
-            if client is None
-            else f"{path}: there is no such client in this transcript"
+        known = ", ".join(map(str, sorted({line.client for line in said}))) or "none"
+        raise UsageError(
+            f"{path}: there is no client {client} in this transcript; it has these: {known}"
         )
     return found, damage
 

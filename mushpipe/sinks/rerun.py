@@ -231,7 +231,9 @@ class RerunSink(Sink):
         if self._shown != (layers, distance, stages):
             self._shown = layers, distance, stages
             log_layers(self._recording, layers, stages)
-            self._recording.send_blueprint(layout(layers, distance))
+            camera = trace.frame.camera
+            spread = camera.width / (2 * camera.fx) if camera else 0.0
+            self._recording.send_blueprint(layout(layers, distance, spread))
         return stages
 
     def _write_notes(self, rr: Any) -> None:

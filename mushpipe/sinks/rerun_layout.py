@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 CAMERA = "camera"
 IMAGE = f"{CAMERA}/image"
 # layers of the image by what a stage puts out, in the order in which they are drawn
@@ -17,9 +19,10 @@ SPACE = CAPS, AXES, TARGETS, ORDER, WORKSPACE = "caps", "axes", "picks", "order"
 COUNTS, TIMES, VALIDITY, LOG = "plots/count", "plots/time", "plots/depth", "log"
 MOMENTS = ("plots/", LOG)  # what stands at a frame alone
 HIDDEN_AT_FIRST = (FRAMES, INITIAL, CIRCLES)
+NARROW = 0.55  # half the width of a bed, in distances, that is seen whole from 0.94 distances away
 
 
-def layout(layers: Sequence[str], distance: float | None) -> Any:
+def layout(layers: Sequence[str], distance: float | None, spread: float) -> Any:
     """Return the blueprint of a run.
 
     Args:
@@ -27,6 +30,7 @@ def layout(layers: Sequence[str], distance: float | None) -> Any:
             the last is shown; every layer can be switched in the panel at the left.
         distance: From the camera to the bed, m, for the first look from the side; None where
             there is no depth, and so nothing to show in space.
+        spread: Half the width that the camera sees, in distances.
     """
     import rerun.blueprint as rrb
 
@@ -38,7 +42,7 @@ def layout(layers: Sequence[str], distance: float | None) -> Any:
     if distance is not None:
         plots.append(rrb.TimeSeriesView(origin=VALIDITY, name="Depth valid, %"))
         holes = rrb.Spatial2DView(origin=IMAGE, name="Depth, holes red", contents=[DEPTH, HOLES])
-        right = [_space_view(distance), holes, *right]
+        right = [_space_view(distance, spread), holes, *right]
     left = rrb.Vertical(_image_view(layers), rrb.Horizontal(*plots), row_shares=[3, 1])
     return rrb.Blueprint(
         rrb.Horizontal(
@@ -65,16 +69,18 @@ def _image_view(layers: Sequence[str]) -> Any:
     )
 
 
-def _space_view(distance: float) -> Any:
+def _space_view(distance: float, spread: float) -> Any:
     import rerun.blueprint as rrb
 
+    middle = np.array([0.0, 0.04, 1.0])
+    eye = middle + np.array([0.0, 0.56, -0.75]) * max(1.0, spread / NARROW)
     return rrb.Spatial3DView(
         origin=CAMERA,
         name="Bed",
         contents=[IMAGE, CLOUD, *(f"{CAMERA}/{name}" for name in SPACE), f"{BASE}/**"],
         eye_controls=rrb.EyeControls3D(
-            position=(0.0, 0.6 * distance, 0.25 * distance),
-            look_target=(0.0, 0.04 * distance, distance),
+            position=distance * eye,
+            look_target=distance * middle,
             eye_up=(0.0, 0.0, -1.0),
         ),
         line_grid=False,

@@ -45,7 +45,13 @@ def log_start(rec: Any, box: tuple[Any, Any] | None, base: Transform | None) -> 
     _draw_space(rec, place)
     if box is not None:
         low, high = np.array(box)
-        shown = rr.Boxes3D(mins=[low], sizes=[high - low], colors=_WHITE, labels=["workspace"])
+        shown = rr.Boxes3D(
+            mins=[low],
+            sizes=[high - low],
+            colors=_WHITE,
+            labels=["workspace"],
+            fill_mode="majorwireframe",  # a filled box would lie over the cloud
+        )
         rec.log(f"{place}/{at.WORKSPACE}", shown, static=True)
 
 

@@ -81,6 +81,7 @@ class Registration(Stage):
 
         Raises:
             DependencyError: open3d or a library of the system is missing.
+            UsageError: There is no such file as the model's.
             InputError: The model's file has too few points.
         """
         import_open3d()

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mushpipe import InputError
 from mushpipe.core.arrays import Floats
+from mushpipe.core.errors import UsageError
 from mushpipe.core.libraries import import_open3d
 
 ASPECT, LIP, STEM, STEM_LENGTH = 0.62, 0.2, 0.4, 1.4  # in rim radii
@@ -67,6 +69,25 @@ def _revolved(rho: Floats, z: Floats, spacing: float) -> tuple[Floats, Floats]:
     return np.concatenate(points), normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
+def _points(o3d: Any, path: Path) -> Floats:
+    """Return the points (M, 3) of a cloud, or as many of a mesh as tell its surface."""
+    if not path.is_file():
+        what = "it is a folder" if path.is_dir() else "there is no such file"
+        raise UsageError(f"model {path}: {what}")
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        mesh = o3d.io.read_triangle_mesh(str(path))
+        cloud = o3d.io.read_point_cloud(str(path))
+    if len(mesh.triangles):
+        o3d.utility.random.seed(0)  # the same model in every run
+        cloud = mesh.sample_points_uniformly(20_000, use_triangle_normal=True)
+    if len(cloud.points) < 100:
+        raise InputError(
+            f"model {path} has {len(cloud.points)} points that Open3D can read: expected a mesh or "
+            "cloud (.ply, .pcd, .obj, .stl) of at least 100"
+        )
+    return np.asarray(cloud.points)
+
+
 def read(path: Path, spacing: float) -> Model:
     """Read a mesh or cloud of an upright mushroom, z up, in any unit.
 
@@ -74,19 +95,12 @@ def read(path: Path, spacing: float) -> Model:
     axis, turned upwards: for a model that does not stand quite upright.
 
     Raises:
-        InputError: The file has no points.
+        UsageError: There is no such file.
+        InputError: The file has too few points.
         DependencyError: open3d is missing.
     """
     o3d = import_open3d()
-    mesh = o3d.io.read_triangle_mesh(str(path))
-    if len(mesh.triangles):
-        o3d.utility.random.seed(0)  # the same model in every run
-        cloud = mesh.sample_points_uniformly(20_000, use_triangle_normal=True)
-    else:
-        cloud = o3d.io.read_point_cloud(str(path))
-    if len(cloud.points) < 100:
-        raise InputError(f"{path} has {len(cloud.points)} points: a model needs at least 100")
-    points = np.asarray(cloud.points)
+    points = _points(o3d, path)
     points = points - [*np.median(points[:, :2], axis=0), 0]
     radius = float(np.quantile(np.hypot(points[:, 0], points[:, 1]), 0.995))
     widest = np.hypot(points[:, 0], points[:, 1]) > 0.9 * radius

@@ -101,6 +101,16 @@ def test_a_missing_system_library_is_named_with_its_package(computer, monkeypatc
     }
 
 
+def test_without_what_runs_networks_no_graph_with_one_starts(computer, monkeypatch):
+    def load() -> None:
+        raise DependencyError("onnxruntime is not installed: pip install onnxruntime")
+
+    monkeypatch.setattr(libraries, "import_onnxruntime", load)
+    ended, found = computer.doctor()
+    assert ended == EXIT_FAILED
+    assert found["onnxruntime"]["cure"] == "pip install onnxruntime"
+
+
 def test_plugins_that_failed_are_listed(computer, monkeypatch):
     registry = Registry()
     registry.broken.append(Broken("glow", "mushpipe-glow", "0.1", "ImportError: no torch"))

@@ -16,7 +16,7 @@ from mushpipe.core.errors import DependencyError, UsageError
 from mushpipe.core.libraries import import_open3d
 from mushpipe.figure import BLUE, RED, draw_diameter, draw_localization, draw_pose, draw_stages
 from mushpipe.stages.nearest_depth import NearestDepth
-from tests.io.values import make_frame, record, trace_of
+from tests.io.values import make_frame, make_picks, record, trace_of
 
 NAN, ONES = float("nan"), np.ones(3)
 
@@ -173,13 +173,62 @@ def test_pose_shows_the_model_before_and_after_beside_the_same_sample() -> None:
         draw_pose(dome(), {"min_points": 10_000})
 
 
+def twice() -> Trace:
+    """The mushroom of `dome` by two circles: the better one is smaller, and sees less of it."""
+    trace = dome()
+    (circles,), (locations,) = trace.outputs["detect"], trace.outputs["locate"]
+    both = Circles(circles.center.repeat(2, axis=0), np.array([24.0, 16.0]), np.array([0.8, 0.9]))
+    return trace_of(trace.frame, detect=both, locate=locations.take(np.array([0, 0])))
+
+
+def picked(trace: Trace) -> Trace:
+    """The same with picks: 8 is the first circle, 7 the second."""
+    circles = trace.outputs["detect"][0].take(np.array([1, 0]))
+    picks = replace(make_picks(), center=circles.center, radius=circles.radius)
+    return replace(trace, outputs={**trace.outputs, "pick": (picks,)})
+
+
+def drawn_poses(trace: Trace, chosen: int | None = None) -> dict[str, float]:
+    """Return the titles before registration, with the width of the sample below, mm."""
+    settings = {"model": "cap", "global": "none", "up": (0, 0, -1)}
+    panels = draw_pose(trace, settings, chosen).axes
+    widths = [float(np.ptp(np.asarray(axes.collections[1]._offsets3d[0]))) for axes in panels]
+    found = {axes.get_title(): width for axes, width in zip(panels, widths, strict=True)}
+    return {title: width for title, width in found.items() if title.endswith(", before")}
+
+
+@needs_open3d
+def test_a_pose_is_that_of_the_mushroom_that_was_chosen() -> None:
+    narrow, wide = drawn_poses(twice()).values()
+    assert narrow < wide
+    assert [*drawn_poses(twice())] == ["(a1) row 1, before", "(a2) row 0, before"]
+    assert [*drawn_poses(picked(twice()))] == ["(a1) pick 7, before", "(a2) pick 8, before"]
+    assert drawn_poses(twice(), 0) == {"(a1) row 0, before": wide}
+    assert drawn_poses(picked(twice()), 7) == {"(a1) pick 7, before": narrow}
+    assert drawn_poses(picked(twice()), 8) == {"(a1) pick 8, before": wide}
+
+
+@needs_open3d
+def test_a_mushroom_that_is_not_there_or_has_no_pose_is_named() -> None:
+    trace = picked(twice())
+    with pytest.raises(UsageError, match="frame 10 has no row 2; those it has: 0, 1"):
+        draw_pose(twice(), {}, 2)
+    with pytest.raises(UsageError, match="frame 10 has no pick 0; those it has: 7, 8"):
+        draw_pose(trace, {}, 0)
+    with pytest.raises(UsageError, match="frame 10: pick 8 has not enough depth"):
+        draw_pose(trace, {"min_points": 10_000}, 8)
+
+
 def test_what_is_missing_is_named(tmp_path: Path) -> None:
     trace = trace_of(make_frame(0))
     with pytest.raises(UsageError, match="frame 10 has no Circles"):
         draw_stages(trace)
-    colour_only = Trace(make_frame(0, depth=None), scene().outputs, {})
+    results = {name: scene().outputs[name] for name in ("detect", "locate")}
+    colour_only = trace_of(make_frame(0, depth=None, camera=None), **results)
     with pytest.raises(UsageError, match="frame 10 has no depth"):
         draw_localization(colour_only)
+    with pytest.raises(UsageError, match="frame 10 has no depth"):
+        draw_pose(colour_only, {})
 
 
 def test_the_command_writes_an_image(tmp_path: Path) -> None:
@@ -191,6 +240,8 @@ def test_the_command_writes_an_image(tmp_path: Path) -> None:
         image = cv2.imread(str(out))
         assert image is not None
         assert image.std() > 10
+    wrong = CliRunner().invoke(app, [*command, "--id", "0"])
+    assert "--id 0: only --kind pose" in str(wrong.exception)
     wrong = CliRunner().invoke(app, ["figure", str(results), "--frame", "10", "-o", "a.xyz"])
     assert isinstance(wrong.exception, UsageError)
     bare = tmp_path / "stages"

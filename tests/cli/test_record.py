@@ -248,6 +248,20 @@ def test_the_duration_counts_the_time_of_the_frames(scene: Path, tmp_path: Path)
     assert np.array_equal(frames[0].depth, picture(0)[1])
 
 
+@pytest.mark.parametrize(
+    ("options", "count"), [([], 15), (["--frames", 3], 3), (["--set", "source.max_frames=4"], 4)]
+)
+def test_a_duration_outlasts_the_frames_that_a_source_gives_by_itself(
+    options: list[object], count: int, tmp_path: Path
+) -> None:
+    settings = {"width": 160, "height": 120, "count": 5, "pins": 0}
+    small = [part for k, v in settings.items() for part in ("--set", f"source.{k}={v}")]
+    command = ["record", "--source", "synthetic", "--duration", 0.5, "-o", "out.mcap"]
+    done = mushpipe(*command, *small, *options, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert f"{count} frames in = {count} processed" in done.stderr
+
+
 def test_a_terminal_shows_rate_drops_and_size(scene: Path, tmp_path: Path) -> None:
     ours, theirs = os.openpty()
     command = endless(scene, "-o", str(tmp_path / "out.mcap"), "--frames", "300")

@@ -194,6 +194,7 @@ AN_IMAGE = "not an MCAP file (it is an image: 'mushpipe record"
         (b"", "the file is empty"),
         (b"MThd\0\0\0\6\0", "not an MCAP file (it begins with b'MThd\\x00\\x00\\x00\\x06')"),
         (b"\x89MC", "not an MCAP file"),
+        (b"RRF2\0\x1d\0\0", "not an MCAP file (it is a Rerun file: open it with 'rerun FILE')"),
         (b"\xff\xd8\xff\xe0\0\x10JFIF", f"{AN_IMAGE} --source IMAGE -o FILE'"),
         (b"\x89PNG\r\n\x1a\n\0\0", f"{AN_IMAGE} --source IMAGE -o FILE'"),
     ],

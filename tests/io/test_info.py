@@ -197,3 +197,6 @@ def test_a_plugin_in_a_file_is_described(tmp_path: Path) -> None:
 def test_an_unknown_plugin_gets_a_suggestion() -> None:
     with pytest.raises(PluginError, match="no plugin 'treshold'; did you mean 'threshold'"):
         describe_plugin(registry(), "treshold")
+    reason = "it may belong to bad-package 1.2, which failed to load: ImportError: no luck"
+    with pytest.raises(PluginError, match=f"there is no plugin 'bad'; .*\n    {reason}$"):
+        describe_plugin(registry(), "bad")

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import rerun as rr
 from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
 
@@ -333,6 +334,8 @@ def test_the_workspace_of_a_robot_in_the_cameras_frame_is_drawn(tmp_path: Path) 
     np.testing.assert_allclose(values(found, "/camera/workspace", "centers"), [[[0, 0, 0.5]]])
     sizes = values(found, "/camera/workspace", "half_sizes")
     np.testing.assert_allclose(sizes, [[[0.2, 0.1, 0.2]]], rtol=1e-6)
+    wires = rr.components.FillMode.MajorWireframe
+    assert values(found, "/camera/workspace", "fill_mode") == [[wires.value]]
 
 
 def test_picks_in_the_robots_frame_stand_below_its_base(tmp_path: Path) -> None:

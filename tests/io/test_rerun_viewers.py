@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ import pytest
 from pydantic import ValidationError
 from rerun.chunk import RrdReader
 
-from mushpipe import Mask, RunInfo, Trace
+from mushpipe import Camera, Mask, RunInfo, Trace
 from mushpipe.core.errors import DependencyError, UsageError
 from mushpipe.sinks import rerun
 from mushpipe.sinks.rerun import RerunSink
@@ -54,6 +55,31 @@ def walk(part: Any) -> list[Any]:
     """Return the views in a container of a blueprint."""
     inside = getattr(part, "contents", [])
     return [part] if not hasattr(part, "kind") else [v for p in inside for v in walk(p)]
+
+
+def first_look(spread: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return where the eye and what it looks at are, for a camera that sees so wide a bed."""
+    sent: list[Any] = []
+    sink = RerunSink(connect="rerun+http://127.0.0.1:1/proxy")
+    sink._recording = SimpleNamespace(send_blueprint=sent.append, log=lambda *_, **__: None)
+    camera = Camera(32, 24, 16 / spread, 16 / spread, 15.5, 11.5)
+    sink._lay_out(trace_of(make_frame(camera=camera), pick=make_picks()))
+    (bed,) = (view for view in walk(sent[0].root_container) if view.name == "Bed")
+    eye = bed.properties["EyeControls3D"]
+    position, target = (
+        batch.as_arrow_array().to_pylist() for batch in (eye.position, eye.look_target)
+    )
+    return np.array(position[0]), np.array(target[0])
+
+
+@pytest.mark.parametrize("spread", [0.3, 0.53, 0.98, 2.0])
+def test_a_wide_bed_is_looked_at_from_as_far_as_it_is_seen_whole(spread: float) -> None:
+    eye, middle = first_look(spread)
+    near, same = first_look(0.5)
+    np.testing.assert_allclose(middle, same)
+    away, usual = eye - middle, near - same
+    times = max(1.0, spread / 0.55)  # half the usual width is just seen from the usual place
+    np.testing.assert_allclose(away, times * usual, rtol=1e-5)
 
 
 def free_port() -> int:

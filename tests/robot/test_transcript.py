@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from mushpipe.core.errors import InputError
+from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.types import Header
 from mushpipe.core.wire import json_message
@@ -187,5 +187,5 @@ def test_a_recording_without_a_transcript(tmp_path: Path) -> None:
     writer.close()
     with pytest.raises(InputError, match="message 0 on /robot/rx is no line of a robot"):
         lines_of(tmp_path / "edited.mcap")
-    with pytest.raises(InputError, match="no such client"):
+    with pytest.raises(UsageError, match=r"no client 77 in this transcript; it has these: 1, 2$"):
         lines_of(tmp_path / "robot.mcap", 77)

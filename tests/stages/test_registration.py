@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mushpipe import Circles, DepthSource, InputError, Locations
-from mushpipe.core.errors import DependencyError
+from mushpipe.core.errors import DependencyError, UsageError
 from mushpipe.core.truth import TRUTH_TOPIC
 from mushpipe.stages.nearest_depth import NearestDepth
 from mushpipe.stages.registration import Registration
@@ -205,11 +205,12 @@ def test_a_mesh_is_the_same_model_each_time_it_is_read(tmp_path) -> None:
     np.testing.assert_array_equal(first.points, second.points)
 
 
-def test_a_model_of_the_users_own_is_read_in_any_unit(tmp_path) -> None:
+def test_a_model_of_the_users_own_is_read_in_any_unit(tmp_path, capfd) -> None:
     own = made(full=True, spacing=0.05)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(own.points * 40 + [7, -3, 90]))
     o3d.io.write_point_cloud(str(tmp_path / "m.ply"), cloud)
     model = read(tmp_path / "m.ply", 0.1)
+    assert capfd.readouterr() == ("", "")
     assert np.hypot(*model.points[:, :2].T).max() == pytest.approx(1, abs=0.05)
     assert model.top == pytest.approx(0.62, abs=0.08)
     assert angle(model.axis, np.array([0, 0, 1])) < 3
@@ -221,6 +222,14 @@ def test_a_file_without_points_is_an_input_error(tmp_path) -> None:
     (tmp_path / "empty.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nend_header\n")
     with pytest.raises(InputError, match="0 points"):
         read(tmp_path / "empty.ply", 0.1)
+
+
+def test_a_file_that_is_not_there_is_a_usage_error(tmp_path, capfd) -> None:
+    with pytest.raises(UsageError, match=r"model .*gone\.ply: there is no such file"):
+        read(tmp_path / "gone.ply", 0.1)
+    with pytest.raises(UsageError, match="it is a folder"):
+        read(tmp_path, 0.1)
+    assert capfd.readouterr() == ("", "")
 
 
 def test_locations_may_come_from_any_stage() -> None:
