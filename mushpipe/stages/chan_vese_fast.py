@@ -150,15 +150,21 @@ def _pull(
 
 
 @jit
-def _means(planes: Singles, u: Bytes, c1: Floats, c2: Floats, known: bool) -> int:
-    """Write the means of the two sides, unless they are known; return the pixels inside."""
-    inside = 0
+def _means(planes: Singles, u: Bytes, c1: Floats, c2: Floats, known: bool) -> tuple[int, float]:
+    """Write the means of the two sides, unless they are known.
+
+    Returns:
+        The pixels inside, and the sum of the squared differences from the means less the squares of
+        the image, which are the same for all regions.
+    """
+    inside, fit = 0, 0.0
     for k in range(len(planes)):
         inside, total, everything = region_sums(planes[k], u)
+        outside, rest = u.size - inside, everything - total
         if not known:
-            c1[k] = total / max(1, inside)
-            c2[k] = (everything - total) / max(1, u.size - inside)
-    return inside
+            c1[k], c2[k] = total / max(1, inside), rest / max(1, outside)
+        fit += c1[k] * (inside * c1[k] - 2 * total) + c2[k] * (outside * c2[k] - 2 * rest)
+    return inside, fit / len(planes)
 
 
 @jit
@@ -184,7 +190,7 @@ def _solve_level(
     """
     other, mixed = np.empty_like(u), np.empty_like(planes[0])
     pull = mu * math.sqrt(2 * math.pi) / SIGMA
-    inside = _means(planes, u, c1, c2, known)
+    inside, _ = _means(planes, u, c1, c2, known)
     for _ in range(most[0]):
         if inside == 0 or inside == u.size:
             break
@@ -193,14 +199,14 @@ def _solve_level(
         u, other = other, u
         if changed == 0:
             break
-        inside = _means(planes, u, c1, c2, known)
+        inside, _ = _means(planes, u, c1, c2, known)
     for _ in range(most[1]):
         if inside == 0 or inside == u.size:
             break
         plane, gain, offset = _force(planes, c1, c2, mixed)
         if icm_sweep(plane, u, gain, offset, mu) == 0:
             break
-        inside = _means(planes, u, c1, c2, known)
+        inside, _ = _means(planes, u, c1, c2, known)
     return u
 
 
@@ -222,13 +228,7 @@ def _length(u: Bytes) -> float:
 @jit
 def _cost(planes: Singles, u: Bytes, mu: float, c1: Floats, c2: Floats, known: bool) -> float:
     """Return the energy of a region, times the pixels, less the squares of the image."""
-    _means(planes, u, c1, c2, known)
-    fit = 0.0
-    for k in range(len(planes)):
-        inside, total, everything = region_sums(planes[k], u)
-        fit += c1[k] * (inside * c1[k] - 2 * total)
-        fit += c2[k] * ((u.size - inside) * c2[k] - 2 * (everything - total))
-    return fit / len(planes) + mu * _length(u)
+    return _means(planes, u, c1, c2, known)[1] + mu * _length(u)
 
 
 def solve_fast(
