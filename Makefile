@@ -51,9 +51,10 @@ lint: $(STAMP)-dev
 types: $(STAMP)-dev
 	$(BIN)/mypy
 
-# The site goes to out/site; `mkdocs serve` shows it while it is written.
+# The site goes to out/site; `mkdocs serve` shows it while it is written. With --quiet, no dead
+# link would count.
 docs: $(STAMP)-dev
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --site-dir out/site
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --site-dir out/site
 
 # The tests start the program some hundred times: Python shall not compile its modules each time.
 unit kernels-pose kernels-others: export PYTHONDONTWRITEBYTECODE :=
