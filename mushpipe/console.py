@@ -57,7 +57,10 @@ def _once() -> Callable[[logging.LogRecord], bool]:
     def is_new(record: logging.LogRecord) -> bool:
         if record.levelno != logging.INFO:
             return True
-        text = record.getMessage()
+        try:
+            text = record.getMessage()
+        except Exception:  # of a plugin, whose arguments do not fit: the handler tells where
+            return True
         new = text not in seen
         seen.add(text)
         return new

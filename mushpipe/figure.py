@@ -245,7 +245,9 @@ def _lay_out_clouds(alignments: list[tuple[str, Alignment]]) -> Figure:
 
 
 def _contour(axes: Axes, mask: Bools) -> None:
-    axes.contour(mask, levels=[0.5], colors=GREEN, linewidths=0.9)
+    # matplotlib draws none of an image with a single row, and warns where there is none
+    if min(mask.shape) > 1 and mask.any() and not mask.all():
+        axes.contour(mask, levels=[0.5], colors=GREEN, linewidths=0.9)
 
 
 def _rings(axes: Axes, circles: Circles, cross: bool = False) -> None:

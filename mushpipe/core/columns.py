@@ -13,7 +13,10 @@ from mushpipe.core.arrays import Bools, locked
 
 
 def _as_given(array: NDArray[Any], given: Any) -> bool:
-    """Return whether conversion has changed no value; NumPy cuts a fraction off without a word."""
+    """Return whether conversion has changed no value; NumPy cuts a fraction off without a word.
+
+    And of None it makes the text "None".
+    """
     return getattr(given, "dtype", None) == array.dtype or np.array_equal(array, given)
 
 
@@ -35,11 +38,11 @@ class Columns:
             given, where = getattr(self, name), f"{type(self).__name__}.{name}"
             try:
                 array = locked(given, dtype)
-            except (TypeError, ValueError) as error:
+            except (TypeError, ValueError, OverflowError) as error:
                 raise ValueError(f"{where}: {error}") from error
-            if dtype.kind in "biu" and not _as_given(array, given):
+            if dtype.kind in "biuU" and not _as_given(array, given):
                 raise ValueError(
-                    f"{where} is declared {dtype}, and was given what that cannot hold"
+                    f"{where} is declared {dtype.name}, and was given what that cannot hold"
                 )
             if array.shape == (0,):  # an empty list, of which nothing tells the shape of a row
                 array = array.reshape(0, *shape)
@@ -82,8 +85,19 @@ class Columns:
         return cls(**{**blank, **known})
 
     def take(self, rows: NDArray[Any]) -> Self:
-        """Return the given rows (indices or a mask), in that order."""
-        return self._of({name: getattr(self, name)[rows] for name in self._columns()})
+        """Return the given rows (indices or a mask), in that order.
+
+        Raises:
+            ValueError: They are no list of rows, but one, say.
+        """
+        # a slice may leave gaps, over which messages are not written
+        taken = {n: np.asarray(getattr(self, n)[rows], order="C") for n in self._columns()}
+        name, (shape, _) = next(iter(self._columns().items()))
+        if taken[name].ndim != 1 + len(shape):
+            raise ValueError(
+                f"{type(self).__name__}.take needs indices (N,) or a mask, not {rows!r}"
+            )
+        return self._of(taken)
 
     def without(self, rows: Bools) -> Self:
         """Return the same rows, of which those of a mask (N,) are unknown."""

@@ -58,7 +58,7 @@ def _stands_still(frame: RgbdFrame, last: RgbdFrame) -> bool:
     return (
         np.array_equal(few, before[::_APART, ::_APART], equal_nan=True)
         and np.array_equal(depth, before, equal_nan=True)
-        and bool((depth > 0).any())
+        and bool(((depth > 0) & (depth < end_of_scale(depth))).any())
     )
 
 

@@ -53,8 +53,12 @@ def _shortened(path: Path) -> Path:
     return short if real(short) == real(path) else path
 
 
-def written_path(path: Path) -> str:
-    """Return a path as manifests hold it, from which a run is repeated in any folder."""
+def written_path(path: Path | str) -> str:
+    """Return a path as manifests hold it, from which a run is repeated in any folder.
+
+    A default of a group may be text, which nobody has validated.
+    """
+    path = Path(path)
     return str(path if path == STDIO else _shortened(path.absolute()))
 
 

@@ -86,7 +86,8 @@ class Transform(Group):
         np.divide(np.maximum(excess, 0), share, out=along, where=share > 0)
         # no axis has more of it than all its variance
         along = np.minimum(along, (variances / np.maximum(squares, 1e-12)).min(axis=1))[:, None]
-        rest = (variances - along * squares) @ (self._matrix() ** 2).T
+        # what is all along the ray leaves nothing, but for rounding
+        rest = np.maximum(variances - along * squares, 0) @ (self._matrix() ** 2).T
         turned = np.sqrt(along * self.directions(rays) ** 2 + rest)
         return np.where(lost, np.inf, turned)
 

@@ -30,7 +30,7 @@ from mushpipe.sinks.rerun_server import (
     answers,
     check_reachable,
     has_display,
-    reached_at,
+    proxy_at,
     start,
 )
 
@@ -175,11 +175,11 @@ class RerunSink(Sink):
                 )
             if not answers("127.0.0.1", PORT):  # a viewer that is open already will do
                 start("127.0.0.1", PORT, "--memory-limit", self.memory)
-            urls.append(f"rerun+http://127.0.0.1:{PORT}/proxy")
+            urls.append(proxy_at("127.0.0.1", PORT))
         if self.serve is not None:
             limit = ("--server-memory-limit", self.memory)
             self._server = start(self.host, self.serve, "--serve-grpc", *limit)
-            urls.append(f"rerun+http://{reached_at(self.host)}:{self.serve}/proxy")
+            urls.append(proxy_at(self.host, self.serve))
             logger.info("look at it with: rerun %s", urls[-1])
         return urls
 

@@ -27,6 +27,12 @@ def reached_at(host: str) -> str:
     return "127.0.0.1" if host in ("0.0.0.0", "::") else host
 
 
+def proxy_at(host: str, port: int) -> str:
+    """Return what viewers of this machine are told to fetch what listens on `host` from."""
+    reached = reached_at(host)
+    return f"rerun+http://{f'[{reached}]' if ':' in reached else reached}:{port}/proxy"
+
+
 def answers(host: str, port: int) -> bool:
     """Return whether something listens there."""
     try:

@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from itertools import starmap
 from typing import Any, TypeVar
 
+import numpy as np
+
 from mushpipe.core import wire
 from mushpipe.core.arrays import Bytes
 from mushpipe.core.errors import InputError
@@ -189,7 +191,8 @@ class Player:
         stated = raw.channel.metadata.get("depth_scale")
         asked = self.settings.depth_scale
         scale = float(stated) if stated else asked
-        if asked is not None and scale not in (None, asked):
+        # RealSense states its scale in single precision
+        if asked is not None and scale and np.float32(scale) != np.float32(asked):
             text = f"it states a depth scale of {scale:g} m, which source.depth_scale ({asked:g})"
             self._warn(f"{text} does not change")
         stamp_ns, frame_id = _stamp(message, raw)

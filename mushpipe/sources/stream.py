@@ -152,12 +152,12 @@ class StreamSource(RecordedSource):
         A recording that is sent can wait as long as its images would for their depth; the images
         of a camera would grow old.
         """
-        head, size, deep = list[Raw](), 0, False
+        head, size, colored, deep = list[Raw](), 0, 0, False
         most = 2 if self.live else Pairing.PATIENCE + 1
         for raw in messages:
             head.append(raw)
             size += len(raw.message.data)
-            colored = _count(head, topics.color)
+            colored += raw.channel.topic == topics.color
             deep |= raw.channel.topic == topics.depth
             if colored and (deep or colored == (most if topics.depth else 2)):
                 break
@@ -176,10 +176,6 @@ class StreamSource(RecordedSource):
     def _nothing_on(self, topic: str, reader: _Messages) -> str:
         found = ", ".join(sorted(reader.topics)) or "nothing"
         return f"the stream has no colour images on {topic}, only {found}"
-
-
-def _count(messages: list[Raw], topic: str) -> int:
-    return sum(raw.channel.topic == topic for raw in messages)
 
 
 def _require_kinds(head: list[Raw], topics: Topics) -> None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from mushpipe.console import Rate
+from mushpipe.console import Rate, set_up_logging
 
 
 def rates(times: np.ndarray) -> list[float]:
@@ -28,3 +29,19 @@ def test_a_camera_that_slows_is_seen_within_seconds() -> None:
 
 def test_frames_that_are_further_apart_have_a_rate_as_well() -> None:
     assert rates(np.array([0, 10, 14])) == pytest.approx([0, 0.1, 0.25])
+
+
+def test_a_notice_is_given_once_and_one_that_is_none_fails_no_frame(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    logger = logging.getLogger("mushpipe")
+    monkeypatch.setattr(logger, "handlers", [])
+    monkeypatch.setattr(logger, "level", logging.NOTSET)
+    monkeypatch.setattr(logger, "propagate", False)  # pytest lets no such record pass
+    set_up_logging(False)
+    for _ in range(2):
+        logger.info("frame %d", 3)
+    logger.info("frame %d", "three")
+    said = capsys.readouterr().err
+    assert said.count("INFO: frame 3") == 1
+    assert "TypeError: %d format" in said

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -72,6 +73,17 @@ def test_stages_show_each_step_and_a_cross_at_each_centre() -> None:
     assert figure.axes[2].images[0].get_array().sum() == 50
     # Nothing upside down: row 0 is at the top, and no circle widens the panel.
     assert circles.get_ylim() == (23.5, -0.5)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (24, 32)])
+@pytest.mark.parametrize("value", [False, True])
+def test_a_mask_without_a_border_has_no_contour(shape: tuple[int, int], value: bool) -> None:
+    mask = np.full(shape, value)
+    frame = make_frame(color=np.zeros((*shape, 3), np.uint8), depth=None, camera=None)
+    trace = trace_of(frame, segment=Mask(mask, mask), detect=Circles.unknown(0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        draw_stages(trace).canvas.draw()
 
 
 def test_localization_shows_nan_before_and_the_estimate_after() -> None:

@@ -14,6 +14,7 @@ from mushpipe import Circles, GraphPath, Mask, RgbdFrame, RunInfo, Sink, SinkPat
 from mushpipe.core.document import Document, parse_document, read_document
 from mushpipe.core.errors import GraphError
 from mushpipe.core.graph import compile_document
+from mushpipe.core.group import Group
 from mushpipe.core.plugins import load_registry
 from mushpipe.sinks.mcap import McapSink
 from mushpipe.sinks.rerun import RerunSink
@@ -516,6 +517,22 @@ def test_default_paths_are_relative_to_the_graph_file(lab: Lab, default: Path):
     assert node.paths == {"path": "x/{recording}.csv"}
     (given,) = lab.compile(graph, "rows.path=y.csv").sinks
     assert given.plugin.path == Path("y.csv")
+
+
+def test_paths_of_groups_that_are_text_by_default_are_written_out(lab: Lab):
+    class Models(Group):
+        first: GraphPath = "a.onnx"
+        second: GraphPath = Path("b.onnx")
+
+    class Reads(Stage):
+        models: Models = Models()
+
+        def process(self, frame: RgbdFrame) -> Mask: ...
+
+    lab.registry.stage("reads", Reads)
+    (node,) = lab.compile(lab.chain("reads")).stages
+    here = {"first": str(Path("a.onnx").absolute()), "second": str(Path("b.onnx").absolute())}
+    assert node.resolved()["models"] == here
 
 
 class Level(Stage):

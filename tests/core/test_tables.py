@@ -24,6 +24,7 @@ from mushpipe import (
 )
 from mushpipe.core.arrays import locked
 from mushpipe.core.truth import Ignore, Instances, Truth
+from mushpipe.core.wire import encoder_of
 
 NAN = np.nan
 
@@ -131,6 +132,8 @@ WRONG = [
         {"source": ["measured", ""]},
         "Locations.source: invalid literal for int() with base 10: 'measured'",
     ),
+    (picks, {"id": [2**64, 0]}, "Picks.id: Python int too large to convert to C long"),
+    (picks, {"flags": [-1, 0]}, "Picks.flags: Python integer -1 out of bounds for uint32"),
     (circles, {"center": [[1, 2], [NAN, 0]]}, "Circles: the centre must be finite (row 1)"),
     (circles, {"radius": [0, 1]}, "Circles: the radius must be positive (row 0)"),
     (circles, {"radius": [1, np.inf]}, "Circles: the radius must be positive (row 1)"),
@@ -228,6 +231,19 @@ def test_rows_are_taken_in_the_order_asked_for():
     assert len(picks().take(np.array([False, False]))) == 0
 
 
+@pytest.mark.parametrize("rows", [1, np.int64(0), np.array([[0], [1]]), True])
+def test_what_is_no_list_of_rows_is_not_taken(rows: Any):
+    with pytest.raises(ValueError, match=r"^Picks\.take needs indices \(N,\) or a mask, not "):
+        picks().take(rows)
+
+
+def test_every_other_row_can_be_recorded():
+    rows: Any = slice(None, None, -1)
+    taken = picks().take(rows)
+    assert taken.id.tolist() == [8, 7]
+    assert len(list(encoder_of(Picks)(taken, Header(0, 0, "camera")))) == 1
+
+
 def test_rows_taken_or_joined_are_locked_and_no_id_comes_twice():
     taken = picks().take(np.array([0]))
     assert not taken.center.flags.writeable
@@ -261,6 +277,19 @@ def test_columns_of_ones_own():
     assert (len(sizes), sizes.box.dtype) == (3, np.float32)
     with pytest.raises(ValueError, match=r"^Sizes\.box has shape \(2, 2\), expected \(N, 2, 2\)$"):
         Sizes("x", np.zeros((2, 2)))
+
+
+@pytest.mark.parametrize("names", [[None, "a"], [1, 2], [b"a", b"b"]])
+def test_texts_are_made_of_nothing_else(names: list[Any]):
+    @dataclass(frozen=True, eq=False)
+    class Kinds(Columns):
+        name: np.ndarray = column(dtype=str)
+
+    assert Kinds(np.array(["a", "longer"])).joined(Kinds(["b"])).name.tolist() == [
+        *("a", "longer", "b")
+    ]
+    with pytest.raises(ValueError, match=r"^Kinds\.name is declared str, and was given what"):
+        Kinds(names)
 
 
 @given(arrays(np.float64, st.integers(1, 5)), st.sampled_from([np.int64, np.uint8, np.bool_]))

@@ -91,6 +91,19 @@ def test_spreads_are_independent_where_nothing_says_they_are_along_the_ray() -> 
     np.testing.assert_allclose(spreads, [[0.002, 0.001, 0.001], [np.nan] * 3])
 
 
+def test_what_spreads_along_the_ray_alone_spreads_nowhere_across_it() -> None:
+    rays = np.random.default_rng(0).uniform((-0.3, -0.3, 0.3), (0.3, 0.3, 1), (200, 3))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    for ray in rays:
+        across = np.cross(ray, (0, 0, 1)) / np.hypot(*ray[:2])
+        turn = Rotation.from_matrix([across, np.cross(ray, across), ray])
+        x, y, z, w = turn.as_quat()
+        spreads = Transform(frame="b", translation=(0, 0, 0), quaternion=(x, y, z, w)).spreads(
+            0.003 * np.abs(ray)[None], ray[None]
+        )
+        np.testing.assert_allclose(spreads, [[0, 0, 0.003]], atol=1e-9)
+
+
 def test_a_spread_that_is_infinite_stays_so() -> None:
     turned = Transform(frame="b", translation=(0, 0, 0), quaternion=(1, 0, 0, 0))
     sigmas = np.array([[0.001, 0.001, np.inf], [0.001, 0.001, 0.002]])

@@ -148,7 +148,7 @@ def test_any_source_is_told_once_of_units_that_cannot_be(
         (False, True, True, None),
     ],
 )
-@pytest.mark.parametrize("kind", ["16UC1", "32FC1", "nothing known"])
+@pytest.mark.parametrize("kind", ["16UC1", "32FC1", "nothing known", "all beyond reach"])
 def test_depth_that_stands_still_is_told_of_once(
     kind: str, still: bool, color_moves: bool, live: bool, said: str | None,
     caplog: pytest.LogCaptureFixture,
@@ -158,7 +158,7 @@ def test_depth_that_stands_still_is_told_of_once(
     if kind != "16UC1":  # missing is NaN there
         first = first.astype(np.float32)
         first[::2] = np.nan
-        first[:, :] = np.nan if kind == "nothing known" else first
+        first[:, :] = {"nothing known": np.nan, "all beyond reach": np.inf}.get(kind, first)
 
     def frames() -> Iterator[RgbdFrame]:
         for number in range(100):
@@ -170,7 +170,7 @@ def test_depth_that_stands_still_is_told_of_once(
 
     assert len(list(judged(frames(), "bed.mcap", live))) == 100
     told = [text for text in caplog.messages if "depth has been the same" in text]
-    if said is None or kind == "nothing known":
+    if said is None or kind in ("nothing known", "all beyond reach"):
         assert not told
     else:
         (text,) = told

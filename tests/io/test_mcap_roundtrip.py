@@ -410,3 +410,14 @@ def test_a_depth_scale_that_the_recording_states_is_kept_and_the_setting_told_of
     assert asked.depth_scale == plain.depth_scale
     assert f"states a depth scale of {plain.depth_scale:g} m" in caplog.text
     assert "source.depth_scale (0.005) does not change" in caplog.text
+
+
+def test_a_depth_scale_that_is_the_recordings_but_for_rounding_is_not_told_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    frame = replace(make_frame(), depth_scale=float(np.float32(0.001)))  # as RealSense states it
+    (asked,) = McapSource(
+        path=record(tmp_path / "a.mcap", [trace_of(frame)]), depth_scale=0.001
+    ).frames()
+    assert asked.depth_scale == frame.depth_scale
+    assert "does not change" not in caplog.text

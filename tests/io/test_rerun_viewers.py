@@ -101,6 +101,14 @@ def test_a_run_is_served_to_viewers_on_this_machine_only(tmp_path: Path) -> None
     wait_for(port, False)
 
 
+def test_a_run_is_served_by_ipv6(tmp_path: Path) -> None:
+    if not Path("/proc/net/if_inet6").exists():
+        pytest.skip("this machine has no IPv6")
+    sink = RerunSink(serve=free_port(), host="::1", save=tmp_path / "out.rrd")
+    feed(sink, [trace_of(make_frame(), pick=make_picks())])
+    assert (tmp_path / "out.rrd").stat().st_size > 0
+
+
 def test_what_is_sent_to_a_viewer_arrives(tmp_path: Path) -> None:
     port = free_port()
     stored = tmp_path / "arrived.rrd"

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -247,6 +248,20 @@ def test_a_sender_without_images_is_not_listened_to_for_ever(
     with pytest.raises(InputError, match="no colour images on /left"):
         list(source.frames())
     os.close(source._number)
+
+
+def test_many_messages_before_the_first_image_are_looked_at_once(tmp_path: Path) -> None:
+    path, header = tmp_path / "s.mcap", Header(10**18, 0, "imu")
+    writer = RecordingWriter(path, {})
+    small = Message("", Schema("Imu", "jsonschema", b"{}", "json"), b"{}")
+    for _ in range(30_000):
+        writer.write("/imu", small, header)
+    writer.frame(RgbdFrame(header, *picture(0)))
+    writer.close()
+    source = opened(path)
+    begin = time.monotonic()
+    assert len(list(source.frames())) == 1
+    assert time.monotonic() - begin < 5  # s; each looked at for each took half a minute
 
 
 @pytest.mark.parametrize(
