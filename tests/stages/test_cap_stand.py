@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mushpipe import Camera
 from mushpipe.stages.cap.blocks import Image
 from mushpipe.stages.cap.order import by_depth
 from mushpipe.stages.cap.stand import stands
@@ -85,3 +86,17 @@ def test_the_bias_of_the_depth_lifts_no_cap_off_its_ground() -> None:
     stage = CapFit(up="camera", depth_bias_mm=10)
     fits = stage.fit(frame.gray, frame.depth_m, CAMERA, circles)
     assert fits.stand == pytest.approx([0.44 - c.apex[2] for c in caps], abs=1e-3)
+
+
+def test_what_the_lens_shows_nothing_of_is_no_ground() -> None:
+    lens = (-0.28, 0.07, 0.0002, 0, -0.01)
+    camera = Camera(320, 240, 165, 165, 159.5, 119.5, "brown_conrady", lens)
+    rays, up = pixel_rays(camera), np.array([0.05, 0, -1]) / np.hypot(0.05, 1)
+    lost = rays[..., 0] > 1e3
+    depth = np.where(lost, 0.4, -0.4 / (rays @ up[:2] + up[2])).astype(np.float32)
+    # at the end of what the lens shows, with neighbours all along the other side
+    circles = np.array([[8.0, 116, 20], [53, 117, 28], [37, 153, 24], [39, 81, 24]])
+    image = Image(depth, rays, by_depth(depth, circles)[1], camera.focal)
+    foot = depth[116, 8] * np.array([*rays[116, 8], 1])
+    found = stands(image, circles, np.tile(foot + 0.05 * up, (4, 1)), up, 0.0)[0]
+    assert np.isnan(found) or found == pytest.approx(0.05, abs=1e-3)

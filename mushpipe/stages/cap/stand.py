@@ -42,6 +42,8 @@ def stands(image: Image, circles: Floats, apexes: Floats, up: Floats, bias: floa
             if not (0 <= u < width and 0 <= v < height):
                 continue
             depth, ray = image.depth[v, u], image.rays[v, u]
+            if ray[0] > 1e3:
+                continue  # where the lens has none
             if depth > 0 and image.ranks[v, u] == len(circles):
                 level[seen] = (depth - bias) * (ray[0] * up[0] + ray[1] * up[1] + up[2])
                 seen += 1
