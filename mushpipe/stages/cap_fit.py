@@ -28,6 +28,7 @@ from mushpipe.stages.cap.gap import EdgeWatch
 from mushpipe.stages.cap.kin import FEWEST, kin_of, unlike
 from mushpipe.stages.cap.model import ASPECT, ASPECT_SIGMA
 from mushpipe.stages.cap.order import Order, by_depth
+from mushpipe.stages.cap.sight import drop_unseen
 from mushpipe.stages.cap.solve import Habit, Noise
 from mushpipe.stages.cap.verify import chances, lone_chances
 from mushpipe.stages.cap_decode import first_of_each
@@ -48,11 +49,11 @@ class CapFit(Stage):
     Eight parameters are fitted to block means of the depth, along their rays; to the depth edge and
     the circle, which touch the cap; and to what caps are like. Nearer mushrooms' circles hide what
     they cover. Over a hole at the centre the position is that of `surface-fit`. Where tilt cannot
-    be seen the sigma says so. A mushroom with hardly any depth is ``missing`` and has no pose.
-    Circles are handed on improved: drawn to the outline of the fitted cap where the image shows
-    little of it. With `min_score` it decides, too, which of them are caps: by their fits, by how
-    they look beside the others, for which it needs no depth, and by what a network sees there whose
-    circles it is given as well.
+    be seen the sigma says so. A mushroom with hardly any depth, or whose fit the camera cannot have
+    seen in its circle, is ``missing`` and has no pose. Circles are handed on improved: drawn to the
+    outline of the fitted cap where the image shows little of it. With `min_score` it decides, too,
+    which of them are caps: by their fits, by how they look beside the others, for which it needs no
+    depth, and by what a network sees there whose circles it is given as well.
     """
 
     up: Up = "bed"
@@ -193,13 +194,15 @@ class CapFit(Stage):
         )
         rank, ranks = order or by_depth(depth, discs)
         x, y, z = upright(self.up, depth, rays).tolist()
-        return fit_caps(
+        fits = fit_caps(
             Frame(gray, Image(depth, rays, ranks, camera.focal)),
             discs,
             rank,
             Habit((x, y, z), float(np.radians(self.tilt_deg)), ASPECT),
             Settings(noise, sensor, self.outline_sigma_px, self.min_points),
         )
+        drop_unseen(fits, discs, camera)
+        return fits
 
     def _bridge(
         self,

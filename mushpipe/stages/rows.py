@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mushpipe import Camera, Circles, Locations, Poses
-from mushpipe.core.arrays import Floats
+from mushpipe.core.arrays import Bools, Floats
 
 _ONE_CHAIN = (
     "circles, locations and poses must come from one chain; what sorts or filters circles belongs "
@@ -13,8 +13,8 @@ _ONE_CHAIN = (
 )
 # Radii from the middle of its circle: a location is seen there, the apex of a leaning cap up to two
 # away. Neighbours are apart by two where they touch.
-_LOCATION_WITHIN = 1.0
-_POSE_WITHIN = 3.0
+LOCATION_WITHIN = 1.0
+POSE_WITHIN = 3.0
 _ROUNDING = 1e-6  # px: to space and back
 
 
@@ -32,15 +32,20 @@ def require_same_rows(
         raise ValueError(f"{counts}: {_ONE_CHAIN}")
     if camera is None:
         return
-    _require_near(circles, camera.project(locations.position), "location", _LOCATION_WITHIN)
+    _require_near(circles, camera.project(locations.position), "location", LOCATION_WITHIN)
     apex = camera.project(poses.apex)
-    _require_near(circles, apex, "pose", _POSE_WITHIN)
+    _require_near(circles, apex, "pose", POSE_WITHIN)
     _require_unexchanged(circles, apex)
+
+
+def apart(seen: Floats, center: Floats, radius: Floats, within: float) -> Bools:
+    """Return which of what is seen (N, 2), px, is farther than so many radii from its circle."""
+    return np.asarray(np.linalg.norm(seen - center, axis=1) > within * radius + _ROUNDING)
 
 
 def _require_near(circles: Circles, seen: Floats, what: str, within: float) -> None:
     """Raise ValueError where what is seen (N, 2), px, is farther than so many radii away."""
-    away = np.linalg.norm(seen - circles.center, axis=1) > within * circles.radius + _ROUNDING
+    away = apart(seen, circles.center, circles.radius, within)
     if away.any():
         row = int(np.flatnonzero(away)[0])
         (u, v), (x, y) = circles.center[row], seen[row]

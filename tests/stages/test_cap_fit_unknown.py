@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,6 +12,7 @@ from hypothesis import strategies as st
 from mushpipe import Camera, Circles, DepthSource, Header, InputError, RgbdFrame
 from mushpipe.stages.cap.regrow import beyond
 from mushpipe.stages.cap_fit import CapFit
+from mushpipe.stages.picks import MakePicks
 from tests.stages.caps import (
     CAMERA,
     angle,
@@ -19,6 +22,7 @@ from tests.stages.caps import (
     frame_from,
     image_of,
 )
+from tests.stages.frames import first
 from tests.stages.test_cap_fit import fit
 
 ONE = Circles([[160.0, 120.0]], [20.0], [1.0])
@@ -166,3 +170,27 @@ def test_a_centre_beyond_the_image_where_the_lens_has_no_ray_ends_no_run() -> No
     locations, poses, _ = CapFit(up="camera").process(frame, circles)
     assert locations.source[0] != DepthSource.MEASURED
     assert not poses.valid[0] or poses.sigma_rad[0] > 1
+
+
+@pytest.mark.parametrize(
+    ("name", "focal", "cx", "circle"),
+    [
+        ("dense", 432.0, 319.5, (639, 455, 35)),
+        ("sparse", 617.0, -192.0, (637, 167, 10)),
+        ("dense", 617.0, -192.0, (637, 23, 16)),
+    ],
+)
+def test_a_sliver_at_the_border_ends_no_run(
+    name: str, focal: float, cx: float, circle: tuple[float, float, float]
+) -> None:
+    """In a wide view, or in a part of one; what is fitted to it would be seen far beside it."""
+    camera = Camera(640, 480, focal, focal, cx, 239.5)
+    frame = replace(first(name), camera=camera)
+    x, y, radius = circle
+    caps = Circles([[x, y], [320.0, 240]], [radius, 20.0], [1.0, 1.0])
+    found, poses, kept = CapFit().process(frame, caps)
+    assert found.missing.tolist() == [True, False]
+    assert poses.valid.tolist() == [False, True]
+    assert kept.center[0].tolist() == [x, y]
+    picks = MakePicks().process(frame, kept, found, poses)
+    assert len(picks) == 2

@@ -263,7 +263,8 @@ def fit_caps(
     )
     fit_all(frame, circles, rank, habit, settings, out)
     up, apexes = np.array(habit.up), np.ascontiguousarray(out[3][:, APEX:])  # as the kernel wants
-    return _fits(*out, up, stands(frame.image, circles, apexes, up))
+    stand = stands(frame.image, circles, apexes, up, settings.sensor.bias)
+    return _fits(*out, up, stand)
 
 
 def _fits(

@@ -96,7 +96,7 @@ class EdgeWatch:
     def _gather(self, frame: RgbdFrame, circles: Circles) -> None:
         # Where nothing moves, the same edges again would say nothing new.
         away = np.linalg.norm(circles.center[:, None] - self._seen, axis=2)
-        new = circles.take((away > circles.radius[:, None]).all(axis=1))
+        new = _large(circles.take((away > circles.radius[:, None]).all(axis=1)))
         self._seen = np.concatenate([self._seen, new.center])[-LATEST:]
         found, places = edge_gaps(frame, new)
         self._gaps = np.concatenate([self._gaps, found])[-LATEST:]
@@ -195,6 +195,12 @@ def _near(gaps: Floats, found: Floats, reach: float) -> Bools:
     return np.asarray(np.abs(gaps[:, 0] - _basis(gaps) @ found) <= reach)
 
 
+def _large(circles: Circles) -> Circles:
+    """Return the circles that are looked at: the largest, and of what is smaller none."""
+    large = np.argsort(-circles.radius, kind="stable")[:MOST]
+    return circles.take(large[circles.radius[large] >= LEAST_RADIUS])
+
+
 def edge_gaps(frame: RgbdFrame, circles: Circles) -> tuple[Floats, int]:
     """Return by how much edges in depth lie outside of those in colour, and where (K, 3).
 
@@ -210,14 +216,13 @@ def edge_gaps(frame: RgbdFrame, circles: Circles) -> tuple[Floats, int]:
     """
     if frame.camera is None:
         raise ValueError("a frame without calibration")
-    large = np.argsort(-circles.radius, kind="stable")[:MOST]
-    large = large[circles.radius[large] >= LEAST_RADIUS]
+    large = _large(circles)
     if not len(large):
         return np.zeros((0, 3)), 0
     depth = np.nan_to_num(frame.depth_m)
     found = [
-        _gaps(frame.gray, depth, frame.camera.fx, circles.center[k], float(circles.radius[k]))
-        for k in large
+        _gaps(frame.gray, depth, frame.camera.fx, center, float(radius))
+        for center, radius in zip(large.center, large.radius, strict=True)
     ]
     gaps, places = zip(*found, strict=True)
     return np.concatenate(gaps), sum(places)

@@ -19,7 +19,7 @@ LEAST = 12  # samples of it
 
 
 @jit
-def stands(image: Image, circles: Floats, apexes: Floats, up: Floats) -> Floats:
+def stands(image: Image, circles: Floats, apexes: Floats, up: Floats, bias: float) -> Floats:
     """Return how far apexes (N,) lie above the ground around their caps, m; NaN if none is seen.
 
     The ground is what no circle covers; its height is the median.
@@ -29,6 +29,7 @@ def stands(image: Image, circles: Floats, apexes: Floats, up: Floats) -> Floats:
         circles: (N, 3) x, y, radius, px.
         apexes: (N, 3) m.
         up: (3,) unit vector.
+        bias: Of the depth, m; apexes are without it.
     """
     height, width = image.depth.shape
     found, level = np.full(len(circles), np.nan), np.empty(len(RING), np.float32)
@@ -41,8 +42,10 @@ def stands(image: Image, circles: Floats, apexes: Floats, up: Floats) -> Floats:
             if not (0 <= u < width and 0 <= v < height):
                 continue
             depth, ray = image.depth[v, u], image.rays[v, u]
+            if ray[0] > 1e3:
+                continue  # where the lens has none
             if depth > 0 and image.ranks[v, u] == len(circles):
-                level[seen] = depth * (ray[0] * up[0] + ray[1] * up[1] + up[2])
+                level[seen] = (depth - bias) * (ray[0] * up[0] + ray[1] * up[1] + up[2])
                 seen += 1
         if seen >= LEAST:
             top = apexes[k, 0] * up[0] + apexes[k, 1] * up[1] + apexes[k, 2] * up[2]
