@@ -11,8 +11,9 @@ COMPILE := $(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true  # some are 
 
 .PHONY: demo test lint types docs unit test-slow recordings clean
 
+# The first time kernels are compiled: those of `cap-fit` on the other core.
 demo: $(STAMP)
-	$(BIN)/mushpipe run graphs/demo.yaml
+	@$(MAKE) --silent kernels-pose & $(BIN)/mushpipe run graphs/demo.yaml; code=$$?; wait; exit $$code
 
 test: $(STAMP)-dev system-libraries
 	$(MAKE) --jobs 2 lint docs types kernels-pose kernels-others
@@ -61,7 +62,7 @@ unit kernels-pose kernels-others: export PYTHONDONTWRITEBYTECODE :=
 
 # Two processes of tests that begin together would compile the same kernels, each for itself.
 .PHONY: kernels-pose kernels-others
-kernels-pose: $(STAMP)-dev
+kernels-pose: $(STAMP)
 	$(BIN)/python -c 'from mushpipe.stages.cap_fit import CapFit; CapFit().open()'
 kernels-others: $(STAMP)-dev
 	$(BIN)/mushpipe run graphs/classic.yaml --set pose.use=surface-fit
