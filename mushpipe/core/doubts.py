@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mushpipe.core.geometry import Camera
-from mushpipe.core.types import RgbdFrame, end_of_scale
+from mushpipe.core.types import RgbdFrame, known
 
 logger = logging.getLogger("mushpipe")
 NEAREST_M, FARTHEST_M = 0.02, 30.0
@@ -58,7 +58,7 @@ def _stands_still(frame: RgbdFrame, last: RgbdFrame) -> bool:
     return (
         np.array_equal(few, before[::_APART, ::_APART], equal_nan=True)
         and np.array_equal(depth, before, equal_nan=True)
-        and bool(((depth > 0) & (depth < end_of_scale(depth))).any())
+        and bool(known(depth).any())
     )
 
 
@@ -67,11 +67,11 @@ def _warned(name: str, frame: RgbdFrame) -> bool:
     if frame.depth is None:
         return False
     depth = frame.depth[::8, ::8]
-    known = depth[(depth > 0) & (depth < end_of_scale(depth))] * frame.depth_scale
-    if not len(known):
+    some = depth[known(depth)] * frame.depth_scale
+    if not len(some):
         return False
     of_camera = list(doubts_of_camera(frame.camera))
-    for doubt in (*doubts(known), *(of_camera or doubts_of_view(known, frame.camera))):
+    for doubt in (*doubts(some), *(of_camera or doubts_of_view(some, frame.camera))):
         logger.warning("%s, frame %d: %s", name, frame.header.sequence, doubt)
     return True
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mushpipe.core.arrays import Singles
 from mushpipe.core.errors import UsageError
 from mushpipe.core.libraries import import_onnxruntime
+from mushpipe.core.paths import require_model
 
 _FLOATS = {
     "tensor(float)": np.float32,
@@ -40,9 +41,7 @@ class OnnxFile:
     """
 
     def __init__(self, path: Path) -> None:
-        if not path.is_file():
-            what = "it is a folder" if path.is_dir() else "there is no such file"
-            raise UsageError(f"model {path}: {what}")
+        require_model(path)
         self.path = path
         # Frames with and without depth may differ in their sizes, and be looked at in several.
         self._session = lru_cache(maxsize=6)(self._opened)

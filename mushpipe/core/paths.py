@@ -74,6 +74,13 @@ def require_listed(folder: Path) -> None:
         raise UsageError(f"{folder}: the folder cannot be read: permission denied")
 
 
+def require_model(path: Path) -> None:
+    """Raise UsageError where there is no file at the path of a model."""
+    if not path.is_file():
+        what = "it is a folder" if path.is_dir() else "there is no such file"
+        raise UsageError(f"model {path}: {what}")
+
+
 def only_recording(path: Path) -> Path:
     """Raise ValueError where a sink's path has more to fill in than the name of its input."""
     if variable := re.search(r"\$\{?[A-Za-z_]\w*\}?", str(path)):

@@ -36,6 +36,11 @@ def end_of_scale(depth: NDArray[Any]) -> np.float32:
     return np.float32(last)
 
 
+def known(depth: NDArray[Any]) -> Bools:
+    """Return which native values are depth, not missing."""
+    return np.asarray((depth > 0) & (depth < end_of_scale(depth)))
+
+
 @dataclass(frozen=True)
 class Header:
     """Where and when a frame was taken.

@@ -15,7 +15,7 @@ from mushpipe.core.arrays import Bools, Bytes, Floats, Singles, locked
 from mushpipe.core.errors import UsageError
 from mushpipe.core.jit import borrower
 from mushpipe.core.onnx_file import OnnxFile
-from mushpipe.core.types import end_of_scale
+from mushpipe.core.types import known
 from mushpipe.stages.cap_decode import CHANNELS, MASK, STRIDE, circles_of, first_of_each
 from mushpipe.stages.discs import (
     LEAST_OF_RANGE,
@@ -224,10 +224,10 @@ def _depth_seen(frame: RgbdFrame) -> float | None:
     if frame.depth is None:
         return None
     depth = frame.depth[::8, ::8]
-    known = depth[(depth > 0) & (depth < end_of_scale(depth))]
-    if len(known) < _LEAST_KNOWN * depth.size:
+    seen = depth[known(depth)]
+    if len(seen) < _LEAST_KNOWN * depth.size:
         return None
-    return float(np.median(known)) * frame.depth_scale
+    return float(np.median(seen)) * frame.depth_scale
 
 
 @borrower

@@ -6,7 +6,7 @@ import numpy as np
 
 from mushpipe import RgbdFrame
 from mushpipe.core.arrays import Bools
-from mushpipe.core.types import end_of_scale
+from mushpipe.core.types import known
 from mushpipe.stages.linear import least_squares
 
 _STEP = 8
@@ -24,7 +24,7 @@ def rise(frame: RgbdFrame, region: Bools) -> float:
     native = frame.depth[::_STEP, ::_STEP]
     depth = native * frame.depth_scale
     inside = region[::_STEP, ::_STEP]
-    v, u = np.nonzero((native > 0) & (native < end_of_scale(native)))
+    v, u = np.nonzero(known(native))
     member = inside[v, u]
     if min(member.sum(), (~member).sum()) < _FEWEST:
         return float("nan")

@@ -10,8 +10,8 @@ import numpy as np
 
 from mushpipe import InputError
 from mushpipe.core.arrays import Floats
-from mushpipe.core.errors import UsageError
 from mushpipe.core.libraries import import_open3d
+from mushpipe.core.paths import require_model
 
 ASPECT, LIP, STEM, STEM_LENGTH = 0.62, 0.2, 0.4, 1.4  # in rim radii
 
@@ -71,9 +71,7 @@ def _revolved(rho: Floats, z: Floats, spacing: float) -> tuple[Floats, Floats]:
 
 def _points(o3d: Any, path: Path) -> Floats:
     """Return the points (M, 3) of a cloud, or as many of a mesh as tell its surface."""
-    if not path.is_file():
-        what = "it is a folder" if path.is_dir() else "there is no such file"
-        raise UsageError(f"model {path}: {what}")
+    require_model(path)
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         mesh = o3d.io.read_triangle_mesh(str(path))
         cloud = o3d.io.read_point_cloud(str(path))
