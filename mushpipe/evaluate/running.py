@@ -158,12 +158,12 @@ def plans(
         raise UsageError(f"--out {out}: a folder of results cannot have braces in its name")
     registry = load_registry()
     sources: Sequence[Path | None] = recordings or [None]
-    names = unique_names(recordings) or ["results"]
+    # without braces, which a sink would take for what it fills in
+    names = numbered([file.stem.translate(_NO_BRACES) for file in recordings]) or ["results"]
     result = []
     for option, label in zip(options, numbered([slug(each) for each in options]), strict=True):
         for number, (name, recording) in enumerate(zip(names, sources, strict=True)):
-            plain = name.translate(_NO_BRACES)  # which a sink would take for what it fills in
-            file = out / ".".join(filter(None, [plain, label, "mcap"]))
+            file = out / ".".join(filter(None, [name, label, "mcap"]))
             varied = [(text, f"--matrix {text}") for text in option.overrides]
             plan = plan_for(graph, recording, [*overrides, *varied], file, registry)
             result.append((option, number, plan))

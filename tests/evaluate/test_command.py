@@ -3,6 +3,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import replace
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -511,6 +512,15 @@ def test_results_of_alternatives_never_share_a_file(graph: Path, tmp_path: Path)
     files = [result_path(plan).name for *_, plan in runs]
     ways = ("a_b.onnx-0", "a_b.onnx-1", "c.onnx")
     assert files == [f"bed.net.model={way}.mcap" for way in ways]
+
+
+def test_results_of_recordings_never_share_a_file(graph: Path, tmp_path: Path) -> None:
+    recordings = [tmp_path / name for name in ("a{1}.mcap", "a(1).mcap", "b.mcap")]
+    for each in recordings:
+        shutil.copy(tmp_path / "bed.mcap", each)
+    runs = plans(graph, recordings, (), [Alternative("")], tmp_path / "out")
+    files = [result_path(plan).name for *_, plan in runs]
+    assert files == ["a(1)-0.mcap", "a(1)-1.mcap", "b.mcap"]
 
 
 def test_matrix_compares_on_the_same_frames(graph: Path, tmp_path: Path) -> None:
