@@ -79,6 +79,22 @@ def _shaded(color: Bytes) -> Bytes:
     return (color * np.linspace(0.25, 1, color.shape[1])[:, None]).astype(np.uint8)
 
 
+def _recoloured(caps: tuple[float, float, float], soil: float) -> Callable[[Bytes], Bytes]:
+    """Return an alteration of the colour of white caps, and of the brightness of dark soil.
+
+    Both are factors of light. What is brighter than three quarters of Otsu's threshold is a cap.
+    """
+
+    def alter(color: Bytes) -> Bytes:
+        gray = cv2.GaussianBlur(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), (0, 0), 1)
+        otsu, _ = cv2.threshold(gray, 0, 255, cv2.THRESH_OTSU)
+        cap = 1 / (1 + np.exp((0.75 * otsu - gray[..., None].astype(np.float64)) / 6))
+        light = (color / 255) ** 2.2 * (cap * np.array(caps) + (1 - cap) * soil)
+        return np.asarray(255 * np.clip(light, 0, 1) ** (1 / 2.2), np.uint8)
+
+    return alter
+
+
 LOOKS: dict[str, Callable[[Bytes], Bytes]] = {
     "as it is": lambda color: color,
     "gamma 0.5": _light(lambda v: v**0.5),
@@ -97,6 +113,8 @@ LOOKS: dict[str, Callable[[Bytes], Bytes]] = {
     "hue + 16": _hue(16, 1),
     "hue - 16": _hue(-16, 1),
     "hue + 90": _hue(90, 1),
+    "brown caps": _recoloured((0.4, 0.25, 0.14), 1),
+    "dark caps on bright soil": _recoloured((0.15, 0.1, 0.06), 4),
     "blur 1 px": _blur(1),
     "blur 2 px": _blur(2),
     "blur 3 px": _blur(3),
