@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
-from itertools import islice
 from string import ascii_lowercase
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -13,21 +12,18 @@ from numpy.typing import NDArray
 
 from mushpipe.core.arrays import Bools, Floats, Singles
 from mushpipe.core.errors import UsageError
-from mushpipe.core.tables import Circles, Locations, Picks
+from mushpipe.core.tables import Circles, Locations
 from mushpipe.core.types import Mask, RgbdFrame, Trace
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from mushpipe.stages.registration import Alignment
-
 T = TypeVar("T")
 GREEN, RED, BLUE = "#28c840", "#e02020", "#1440e0"
 PANEL_IN = 4.6  # width of an image
 DPI = 150
 FONT = 6  # points
-POSES = 3  # mushrooms
 
 
 class Panel(NamedTuple):
@@ -65,9 +61,9 @@ def draw_localization(trace: Trace) -> Figure:
     Raises:
         UsageError: The frame has no depth, no circles or no locations.
     """
-    circles, locations = _located(trace)
+    circles, locations = located(trace)
     frame = trace.frame
-    depth_m = _depth_m(frame)
+    depth_m = depth_m_of(frame)
     height, width = depth_m.shape
     u, v = np.rint(circles.center).astype(int).T
     depth = depth_m[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)].astype(np.float64)
@@ -92,7 +88,7 @@ def draw_diameter(trace: Trace) -> Figure:
     Raises:
         UsageError: The frame has no circles or no locations.
     """
-    circles, locations = _located(trace)
+    circles, locations = located(trace)
 
     def draw(axes: Axes) -> None:
         _rings(axes, circles)
@@ -100,39 +96,6 @@ def draw_diameter(trace: Trace) -> Figure:
             _text(axes, x, y, f"{diameter:.0f}" if np.isfinite(diameter) else "NaN", RED)
 
     return _lay_out([Panel("diameter, mm", trace.frame.color, draw)], columns=1, scale=1.9)
-
-
-def draw_pose(trace: Trace, settings: Mapping[str, Any], chosen: int | None = None) -> Figure:
-    """Draw the model (red) and the sample (blue) before and after registration, seen from the side.
-
-    Args:
-        trace: The frame.
-        settings: Of the stage `registration`, which is run anew on the best circles.
-        chosen: Id of the mushroom's pick; without picks its row among the circles.
-
-    Raises:
-        UsageError: The frame has no depth, no circles, no locations, no such mushroom, or none that
-            can be registered.
-        DependencyError: open3d or a library of the system is missing.
-    """
-    from mushpipe.stages.registration import Registration
-
-    circles, locations = _located(trace)
-    stage = Registration.model_validate(dict(settings))
-    # the frame that the stage got, where the recording has it: its depth may have been corrected
-    frame = ([trace.frame] + [value for _, value in trace.of(RgbdFrame)])[-1]
-    _depth_m(frame)
-    kind, rows = _by_number(trace, circles)
-    best = np.argsort(-circles.score, kind="stable").tolist()
-    tried = best if chosen is None else [_row(frame, kind, rows, chosen)]
-    names = {row: f"row {row}" for row in tried} | {row: f"{kind} {n}" for n, row in rows.items()}
-    tries = ((names[row], stage.align(frame, circles, locations, row, 0)) for row in tried)
-    found = list(islice(((name, each) for name, each in tries if each is not None), POSES))
-    if not found:
-        which = "no mushroom has" if chosen is None else f"{kind} {chosen} has not"
-        number = trace.frame.header.sequence
-        raise UsageError(f"frame {number}: {which} enough depth, or the model ran away")
-    return _lay_out_clouds(found)
 
 
 KINDS: dict[str, Callable[[Trace], Figure]] = {
@@ -153,32 +116,19 @@ def _last(trace: Trace, kind: type[T]) -> T:
     return found[-1]
 
 
-def _by_number(trace: Trace, circles: Circles) -> tuple[str, dict[int, int]]:
-    """Return what mushrooms are known by, ids of picks or else rows, and each one's row by that."""
-    picks = [value for _, value in trace.of(Picks)]
-    if not picks:
-        return "row", {row: row for row in range(len(circles))}
-    same = (circles.center[:, None] == picks[-1].center).all(axis=2)
-    rows, places = np.nonzero(same & (circles.radius[:, None] == picks[-1].radius))
-    return "pick", dict(zip(picks[-1].id[places].tolist(), rows.tolist(), strict=True))
-
-
-def _row(frame: RgbdFrame, kind: str, rows: Mapping[int, int], chosen: int) -> int:
-    if chosen not in rows:
-        known = ", ".join(map(str, sorted(rows))) or "none"
-        there = f"frame {frame.header.sequence} has no {kind} {chosen}; those it has: {known}"
-        raise UsageError(f"--id {chosen}: {there}")
-    return rows[chosen]
-
-
-def _depth_m(frame: RgbdFrame) -> Singles:
+def depth_m_of(frame: RgbdFrame) -> Singles:
+    """Return its depth in metres; raise UsageError where it has none."""
     if frame.depth is None:
         raise UsageError(f"frame {frame.header.sequence} has no depth to draw")
     return frame.depth_m
 
 
-def _located(trace: Trace) -> tuple[Circles, Locations]:
-    """Return the last locations with their circles: those of the same stage, or the last above."""
+def located(trace: Trace) -> tuple[Circles, Locations]:
+    """Return the last locations with their circles: those of the same stage, or the last above.
+
+    Raises:
+        UsageError: The frame has none, or they do not belong together.
+    """
     locations = _last(trace, Locations)
     circles = _last(trace, Circles)
     for values in trace.outputs.values():
@@ -212,35 +162,6 @@ def _lay_out(panels: list[Panel], columns: int, scale: float = 1.0) -> Figure:
         panel.draw(axes)
     for axes in places:
         axes.set_axis_off()
-    return figure
-
-
-def _lay_out_clouds(alignments: list[tuple[str, Alignment]]) -> Figure:
-    from matplotlib.figure import Figure
-
-    n = len(alignments)
-    figure = Figure(figsize=(0.75 * PANEL_IN * n, 1.5 * PANEL_IN), dpi=DPI, layout="constrained")
-    panels = figure.subplots(2, n, subplot_kw={"projection": "3d"}, squeeze=False)
-    for column, (name, alignment) in enumerate(alignments):
-        clouds = (alignment.before, alignment.after)
-        middle = alignment.sample.mean(axis=0)
-        reach = 1e3 * max(np.abs(cloud - middle).max() for cloud in clouds)
-        for row, (model, when) in enumerate(zip(clouds, ("before", "after"), strict=True)):
-            axes = panels[row, column]
-            for cloud, color, size, alpha in (
-                (model, RED, 2, 0.35),
-                (alignment.sample, BLUE, 5, 1.0),
-            ):
-                x, y, z = 1e3 * (cloud - middle).T
-                axes.scatter(x, y, z, s=size, color=color, alpha=alpha, depthshade=False)
-            # z of the optical frame points down, onto the bed
-            axes.set(xlim=(-reach, reach), ylim=(-reach, reach), zlim=(reach, -reach))
-            for letter in "xyz":
-                getattr(axes, f"set_{letter}label")(f"{letter}, mm", fontsize=7, labelpad=-6)
-            axes.view_init(elev=12, azim=-60)
-            axes.tick_params(labelsize=6, pad=-3)
-            axes.set_box_aspect((1, 1, 1), zoom=0.95)
-            axes.set_title(f"({'ab'[row]}{column + 1}) {name}, {when}", fontsize=9)
     return figure
 
 

@@ -13,7 +13,9 @@ import typer
 from mushpipe.options import file_argument
 
 if TYPE_CHECKING:
+    from mushpipe.core.types import Trace
     from mushpipe.sinks.rerun import RerunSink
+    from mushpipe.stages.registration import Alignment
 
 
 class FigureKind(StrEnum):
@@ -33,7 +35,10 @@ def register(app: typer.Typer) -> None:
 
 def figure(
     results: Annotated[Path, file_argument("recording written by a sink mcap")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="image to write: .png .jpg .pdf .svg")],
+    out: Annotated[
+        Path,
+        typer.Option("--out", "-o", help="image to write: .png .jpg .pdf .svg; .rrd of a pose"),
+    ],
     kind: Annotated[FigureKind, typer.Option(help="which figure")] = FigureKind.stages,
     frame: Annotated[int, typer.Option(help="number of the frame")] = 0,
     id_: Annotated[
@@ -45,31 +50,45 @@ def figure(
     from mushpipe.console import set_up_logging
     from mushpipe.core.errors import MushpipeError, UsageError
     from mushpipe.core.overwriting import require_writable, spare
-    from mushpipe.figure import KINDS, draw_pose
-    from mushpipe.traces import read_manifest, read_trace
+    from mushpipe.figure import KINDS
+    from mushpipe.figure_pose import draw_pose
+    from mushpipe.sinks.rerun_clouds import write_clouds
+    from mushpipe.traces import read_trace
 
     set_up_logging(False)
     if not out.suffix:  # matplotlib would write another file, out.png
         raise UsageError(f"{out}: expected the kind of image in its name: {out}.png, say")
     if id_ is not None and kind is not FigureKind.pose:
         raise UsageError(f"--id {id_}: only --kind pose draws one mushroom, {kind} draws all")
+    rerun = out.suffix.lower() == ".rrd"
+    if rerun and kind is not FigureKind.pose:
+        text = f"{out}: only --kind pose is drawn in space; mushpipe view {results} --save {out} "
+        raise UsageError(f"{text}writes all the rest")
     spare(out, results)
     require_writable(out)
     trace = read_trace(results, frame)
-    if kind is FigureKind.pose:
-        graph = read_manifest(results).get("graph", {})
-        stages = graph.get("stages", {}).values()
-        stages = [s for s in stages if s["use"].rpartition(":")[2] == "registration"]
-        settings = {k: v for s in stages[-1:] for k, v in s.items() if k not in ("use", "inputs")}
-        drawn = draw_pose(trace, settings, id_)
-    else:
-        drawn = KINDS[kind](trace)
+    poses = _aligned(results, trace, id_) if kind is FigureKind.pose else None
+    if poses and rerun:
+        write_clouds(out, poses)
+        return
+    drawn = draw_pose(poses) if poses else KINDS[kind](trace)
     try:
         drawn.savefig(out)
     except ValueError as error:  # a suffix that matplotlib does not know
         raise UsageError(f"{out}: {error}") from error
     except OSError as error:
         raise MushpipeError(f"{out}: cannot be written: {error.strerror}") from error
+
+
+def _aligned(results: Path, trace: Trace, id_: int | None) -> list[tuple[str, Alignment]]:
+    """Register mushrooms of a frame as the graph's `registration` did, if it has one."""
+    from mushpipe.figure_pose import aligned
+    from mushpipe.traces import read_manifest
+
+    stages = read_manifest(results).get("graph", {}).get("stages", {}).values()
+    stages = [s for s in stages if s["use"].rpartition(":")[2] == "registration"]
+    settings = {k: v for s in stages[-1:] for k, v in s.items() if k not in ("use", "inputs")}
+    return aligned(trace, settings, id_)
 
 
 def view(

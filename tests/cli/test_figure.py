@@ -15,7 +15,8 @@ from mushpipe import Camera, Circles, DepthSource, Locations, Mask, Trace
 from mushpipe.cli import app
 from mushpipe.core.errors import DependencyError, UsageError
 from mushpipe.core.libraries import import_open3d
-from mushpipe.figure import BLUE, RED, draw_diameter, draw_localization, draw_pose, draw_stages
+from mushpipe.figure import BLUE, RED, draw_diameter, draw_localization, draw_stages
+from mushpipe.figure_pose import aligned, draw_pose
 from mushpipe.stages.nearest_depth import NearestDepth
 from tests.io.values import make_frame, make_picks, record, trace_of
 
@@ -168,7 +169,9 @@ def dome() -> Trace:
 
 @needs_open3d
 def test_pose_shows_the_model_before_and_after_beside_the_same_sample() -> None:
-    before, after = draw_pose(dome(), {"model": "cap", "global": "none", "up": (0, 0, -1)}).axes
+    before, after = draw_pose(
+        aligned(dome(), {"model": "cap", "global": "none", "up": (0, 0, -1)})
+    ).axes
     (model, sample), (moved, same) = before.collections, after.collections
     for a, b in zip(sample._offsets3d, same._offsets3d, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -182,7 +185,7 @@ def test_pose_shows_the_model_before_and_after_beside_the_same_sample() -> None:
     assert 35 < y < 41
     assert 10 < z < 21
     with pytest.raises(UsageError, match="no mushroom has enough depth"):
-        draw_pose(dome(), {"min_points": 10_000})
+        aligned(dome(), {"min_points": 10_000})
 
 
 def twice() -> Trace:
@@ -203,7 +206,7 @@ def picked(trace: Trace) -> Trace:
 def drawn_poses(trace: Trace, chosen: int | None = None) -> dict[str, float]:
     """Return the titles before registration, with the width of the sample below, mm."""
     settings = {"model": "cap", "global": "none", "up": (0, 0, -1)}
-    panels = draw_pose(trace, settings, chosen).axes
+    panels = draw_pose(aligned(trace, settings, chosen)).axes
     widths = [float(np.ptp(np.asarray(axes.collections[1]._offsets3d[0]))) for axes in panels]
     found = {axes.get_title(): width for axes, width in zip(panels, widths, strict=True)}
     return {title: width for title, width in found.items() if title.endswith(", before")}
@@ -224,11 +227,11 @@ def test_a_pose_is_that_of_the_mushroom_that_was_chosen() -> None:
 def test_a_mushroom_that_is_not_there_or_has_no_pose_is_named() -> None:
     trace = picked(twice())
     with pytest.raises(UsageError, match="frame 10 has no row 2; those it has: 0, 1"):
-        draw_pose(twice(), {}, 2)
+        aligned(twice(), {}, 2)
     with pytest.raises(UsageError, match="frame 10 has no pick 0; those it has: 7, 8"):
-        draw_pose(trace, {}, 0)
+        aligned(trace, {}, 0)
     with pytest.raises(UsageError, match="frame 10: pick 8 has not enough depth"):
-        draw_pose(trace, {"min_points": 10_000}, 8)
+        aligned(trace, {"min_points": 10_000}, 8)
 
 
 def test_what_is_missing_is_named(tmp_path: Path) -> None:
@@ -240,7 +243,7 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="frame 10 has no depth"):
         draw_localization(colour_only)
     with pytest.raises(UsageError, match="frame 10 has no depth"):
-        draw_pose(colour_only, {})
+        aligned(colour_only, {})
 
 
 def test_the_command_writes_an_image(tmp_path: Path) -> None:
