@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mushpipe.core.arrays import Floats
 from mushpipe.core.geometry import Camera
 from mushpipe.core.types import RgbdFrame, known
 
@@ -20,8 +21,12 @@ WIDEST_DEG = 160.0
 CAP_M, CAP_PX = 0.04, 16.0
 OFF_CENTRE = 1 / 6  # share of the image; of cropped images alone principal points lie further off
 ALIKE = 0.1  # shares, or ratios, that differ by less are the same
+# A `bow`: of beds in z it is 0.4 at most, of the same in ranges nearly always 0.75 to 1.4.
+BOWED, MOST_BOWED = 0.6, 1.6
+NARROW = 0.03  # by so much longer, at the border, a narrow view's ranges are no bowl to be seen
 STILL = 30  # frames
 _APART = 16  # px between those that are compared first
+_FEWEST_POINTS, _MOST_POINTS = 500, 5000
 _FEWEST_LEVELS = 6
 _FEWEST_EACH = 8  # depths a level: unlike steps, chance seldom meets a level twice
 
@@ -67,11 +72,16 @@ def _warned(name: str, frame: RgbdFrame) -> bool:
     if frame.depth is None:
         return False
     depth = frame.depth[::8, ::8]
-    some = depth[known(depth)] * frame.depth_scale
+    there = known(depth)
+    some = depth[there].astype(np.float64) * frame.depth_scale
     if not len(some):
         return False
-    of_camera = list(doubts_of_camera(frame.camera))
-    for doubt in (*doubts(some), *(of_camera or doubts_of_view(some, frame.camera))):
+    told = list(doubts_of_camera(frame.camera))
+    if frame.camera is not None and not told:
+        pixels = 8 * np.argwhere(there)[:, ::-1].astype(np.float64)
+        of_range = doubts_of_points(frame.camera.deproject(pixels, some))
+        told = [*doubts_of_view(some, frame.camera), *of_range]
+    for doubt in (*doubts(some), *told):
         logger.warning("%s, frame %d: %s", name, frame.header.sequence, doubt)
     return True
 
@@ -118,6 +128,49 @@ def doubts_of_view(depth: NDArray[Any], camera: Camera | None) -> Iterator[str]:
             f"{camera.width}x{camera.height}: caps may be missed, and others found; if that is not "
             "how far the bed is away, set source.depth_scale, or the focal length, to what they are"
         )
+
+
+def doubts_of_points(points: Floats) -> Iterator[str]:
+    """Yield why points (N, 3), m, seem to have been made of ranges, and what to do about it."""
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) < _FEWEST_POINTS:
+        return
+    points = points[:: 1 + len(points) // _MOST_POINTS]
+    longer = float(np.percentile(_stretch(points), 98)) - 1
+    if longer > NARROW and BOWED < bow(points) < MOST_BOWED:
+        yield (
+            "depth looks like the distance from the camera (range), not along its axis (z): so "
+            "taken the bed is flat, else a bowl; make it z, for as it is, what is seen at the "
+            f"border is placed up to {1000 * longer * float(np.median(points[:, 2])):.0f} mm too "
+            "far away"
+        )
+
+
+def bow(points: Floats) -> float:
+    """Return how far a bed departs from a plane towards what a plane's ranges look like as z.
+
+    A plane has 1/z = a + b x/z + c y/z; its ranges are longer than z by the `_stretch` s of their
+    rays, 1/range = (a + b x/z + c y/z) (1 + g (1/s - 1)) with g = 1. The g returned is that of
+    least squares without the farthest points, which caps are.
+
+    Args:
+        points: (N, 3) m.
+    """
+    inverse, bowl = 1 / points[:, 2], 1 / _stretch(points) - 1
+    plane = np.column_stack([np.ones(len(points)), points[:, :2] * inverse[:, None]])
+    kept, share = np.ones(len(points), bool), 0.0
+    for _ in range(4):
+        flat = plane @ np.linalg.lstsq(plane[kept], inverse[kept], rcond=None)[0]
+        both = np.column_stack([plane, flat * bowl])
+        found = np.linalg.lstsq(both[kept], inverse[kept], rcond=None)[0]
+        off = np.abs(both @ found - inverse)
+        kept, share = off <= 2.5 * np.median(off), float(found[3])
+    return share
+
+
+def _stretch(points: Floats) -> Floats:
+    """Return how much longer the rays (N,) of points are than their z."""
+    return np.asarray(np.linalg.norm(points, axis=1) / points[:, 2])
 
 
 def doubts_of_camera(camera: Camera | None) -> Iterator[str]:

@@ -13,7 +13,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mushpipe import Camera, Header, RgbdFrame
-from mushpipe.core.doubts import STILL, doubts, doubts_of_camera, doubts_of_view, judged
+from mushpipe.core.arrays import Floats
+from mushpipe.core.doubts import (
+    STILL,
+    bow,
+    doubts,
+    doubts_of_camera,
+    doubts_of_points,
+    doubts_of_view,
+    judged,
+)
 from tests.core.lab import Frames, Lab
 from tests.stages.frames import SIMULATED, first, recorded
 
@@ -65,8 +74,65 @@ def test_simulated_depth_is_not_doubted(path: Path) -> None:
 
 def every_doubt(frame: RgbdFrame, scale: float = 1) -> list[str]:
     depth = scale * frame.depth_m[np.isfinite(frame.depth_m)]
-    view = doubts_of_view(depth, frame.camera)
-    return [*doubts(depth), *view, *doubts_of_camera(frame.camera)]
+    view, points = doubts_of_view(depth, frame.camera), doubts_of_points(points_of(frame, scale))
+    return [*doubts(depth), *view, *points, *doubts_of_camera(frame.camera)]
+
+
+def points_of(frame: RgbdFrame, scale: float = 1) -> Floats:
+    """Return every eighth point each way, m."""
+    assert frame.camera is not None
+    depth = np.full_like(frame.depth_m, np.nan)
+    depth[::8, ::8] = scale * frame.depth_m[::8, ::8]
+    rows, columns = np.nonzero(np.isfinite(depth))
+    pixels = np.column_stack([columns, rows]).astype(float)
+    return frame.camera.deproject(pixels, depth[rows, columns].astype(float))
+
+
+def as_ranges(points: Floats) -> Floats:
+    """Return what points become if their distance from the camera is taken for their z."""
+    away = np.linalg.norm(points, axis=1)
+    return points / points[:, 2:] * away[:, None]
+
+
+BEDS = ["first-bed", "sparse", "tilted", "brown", "dense", "harsh-light", "gaps", "moving", "lab"]
+
+
+@pytest.mark.parametrize("name", BEDS)
+def test_ranges_of_a_bed_are_doubted(name: str) -> None:
+    points = points_of(first(name))
+    assert not list(doubts_of_points(points))
+    (told,) = doubts_of_points(as_ranges(points))
+    assert "depth looks like the distance from the camera (range), not along its axis" in told
+    off = np.linalg.norm(as_ranges(points), axis=1) - np.linalg.norm(points, axis=1)
+    (most,) = re.findall(r"up to (\d+) mm too far", told)
+    assert int(most) == pytest.approx(1000 * np.percentile(off, 98), rel=0.15)
+
+
+@pytest.mark.parametrize("name", ["desk-july", "desk-june", "white-bed-0"])
+def test_ranges_of_a_real_bed_are_doubted(name: str) -> None:
+    for frame in recorded(name):
+        assert list(doubts_of_points(as_ranges(points_of(frame))))
+
+
+@given(st.integers(0, 2**32), st.floats(-0.5, 0.5), st.floats(-0.5, 0.5), st.floats(0.2, 2))
+def test_a_plane_is_not_bowed_and_its_ranges_are(
+    seed: int, across: float, along: float, away: float
+) -> None:
+    """Seen at any slant up to 35 degrees, with caps on half of it and a little noise."""
+    rng = np.random.default_rng(seed)
+    rays = rng.uniform((-0.52, -0.39), (0.52, 0.39), (3000, 2))
+    z = away / (1 + rays @ [across, along])
+    z *= 1 - np.where(rng.random(3000) < 0.3, rng.uniform(0, 0.06, 3000), 0)
+    points = np.column_stack([rays, np.ones(3000)]) * (z * rng.normal(1, 1e-3, 3000))[:, None]
+    assert abs(bow(points)) < 0.3
+    assert bow(as_ranges(points)) > 0.6
+
+
+def test_ranges_in_a_narrow_view_or_of_few_points_are_not_judged() -> None:
+    points = points_of(first("sparse"))
+    assert not list(doubts_of_points(as_ranges(points)[::20]))
+    narrow = np.linalg.norm(points[:, :2], axis=1) < 0.2 * points[:, 2]
+    assert not list(doubts_of_points(as_ranges(points[narrow])))
 
 
 @pytest.mark.parametrize("name", ["first-bed", "sparse", "tilted", "brown", "dense"])
