@@ -292,6 +292,22 @@ def test_what_was_put_off_is_accepted_only_where_it_is_seen() -> None:
     assert ledger.apply("a", 1, "accepted", 0, visible=False, now=1802) == "removed"  # its own
 
 
+def test_only_so_many_targets_are_held_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mushpipe.robot.ledger.MOST_ENTRIES", 3)
+    ledger = Ledger()
+    for target, outcome in ((1, "accepted"), (2, "rejected"), (3, "accepted")):
+        assert ledger.apply("a", target, outcome, 9, visible=True, now=0) == "removed"  # type: ignore[arg-type]
+    with pytest.raises(Refusal) as caught:
+        ledger.apply("b", 4, "accepted", 0, visible=True, now=0)
+    assert caught.value.code == "busy"
+    assert hidden(ledger) == {1, 2, 3}
+    # neither what is held already nor what leaves the list counts as one more
+    assert ledger.apply("a", 1, "accepted", 0, visible=True, now=0) == "removed"
+    assert ledger.apply("b", 5, "done", 0, visible=True, now=0) == "removed"
+    assert ledger.apply("a", 3, "failed", 0, visible=True, now=0) == "restored"
+    assert ledger.apply("b", 4, "accepted", 0, visible=True, now=0) == "removed"
+
+
 class Hasty(Hub):
     """A hub to which a result in another frame comes as soon as one was looked at."""
 
