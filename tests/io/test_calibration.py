@@ -6,8 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import foxglove
 import numpy as np
 import pytest
+from foxglove.channels import CameraCalibrationChannel, RawImageChannel
+from foxglove.messages import CameraCalibration
 
 from mushpipe.core.errors import InputError
 from mushpipe.core.geometry import Camera
@@ -34,6 +37,7 @@ from tests.io.bags import (
     depth_pixels,
     drain,
     encoded,
+    foxglove_entries,
     play,
     raw_image,
     write_bag,
@@ -340,6 +344,25 @@ def test_rectified_images_have_the_projection_matrix_and_no_distortion(
         message = compressed(encoded(color_pixels(0), ".png"), "rgb8; png compressed bgr8")
     entries = [(f"{topic.partition('/image')[0]}/camera_info", T0, info), (topic, T0, message)]
     assert cameras(tmp_path, entries) == [Camera(WIDTH, HEIGHT, 500.0, 510.0, 3.0, 2.0)]
+
+
+def test_rectified_images_of_a_foxglove_recording_have_the_projection_matrix(
+    tmp_path: Path,
+) -> None:
+    path, context = tmp_path / "f.mcap", foxglove.Context()
+    _, (_, _, image), *_ = foxglove_entries(1)
+    info = CameraCalibration(
+        width=WIDTH,
+        height=HEIGHT,
+        distortion_model="plumb_bob",
+        D=[0.1, 0, 0, 0, 0],
+        K=[FX, 0, CX, 0, FY, CY, 0, 0, 1],
+        P=[500.0, 0, 3, 0, 0, 510.0, 2, 0, 0, 0, 1, 0],
+    )
+    with foxglove.open_mcap(path, context=context):
+        CameraCalibrationChannel("/rect/camera_info", context=context).log(info, log_time=T0)
+        RawImageChannel("/rect/image", context=context).log(image, log_time=T0)
+    assert [frame.camera for frame in play(path)] == [Camera(WIDTH, HEIGHT, 500.0, 510.0, 3.0, 2.0)]
 
 
 def test_a_given_camera_takes_the_place_of_one_that_cannot_be_decoded(tmp_path: Path) -> None:

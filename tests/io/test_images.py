@@ -237,6 +237,7 @@ def test_a_unit_from_the_user_makes_mono16_readable(tmp_path: Path) -> None:
         (raw_image(RGB, "bayer_rggb8"), "colour encoding 'bayer_rggb8' is not known (known: rgb8"),
         (raw_image(GRAY, "rgb8"), "8x6 image with step 8 in 48 bytes, rgb8 needs 3 bytes a pixel"),
         (raw_image(RGB, "rgb8", data=b""), "8x6 image with step 24 in 0 bytes"),
+        (raw_image(RGB[:, :0], "rgb8"), "0x6 image with step 0 in 0 bytes"),
         (raw_image(np.zeros((6, 7, 2), np.uint8), "yuv422"), "yuv422 image of odd width 7"),
     ],
 )
