@@ -108,6 +108,15 @@ def test_a_claim_is_where_its_mushroom_was_last_seen() -> None:
     assert scene.show(bed(6)) == [6, 7, 8]
 
 
+def test_a_claim_follows_its_mushroom_also_through_results_that_nobody_asks_for() -> None:
+    scene = Scene()
+    scene.show(bed(0))
+    scene.say("a", 1, "accepted")
+    scene.hub.publish(bed(0, (0.03, 0, 0)), 0, 0, scene.clock.now)
+    scene.hub.tick(scene.clock.now)
+    assert scene.show(bed(3, (0.03, 0, 0))) == [3, 5]
+
+
 def test_what_is_done_hides_nothing_that_comes_to_light_there() -> None:
     scene = Scene()
     scene.show(bed(0))

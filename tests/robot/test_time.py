@@ -159,6 +159,21 @@ def test_a_recording_has_no_camera_to_lose() -> None:
     assert hub.state(clock.now) == "stalled"
 
 
+@pytest.mark.parametrize(
+    ("ending", "state"), [("end", "stalled"), ("failed", "stalled"), ("no_camera", "no_camera")]
+)
+def test_once_the_run_has_ended_nothing_is_fresh(ending: Ending, state: str) -> None:
+    clock = FakeClock()
+    hub, _ = hub_on(clock)
+    hub.publish(choice(), 0, 0, clock.now)
+    assert hub.state(clock.now) == "running"
+    hub.ending = ending
+    assert hub.state(clock.now) == state
+    with pytest.raises(Refusal) as caught:
+        hub.fresh(clock.now, 10)
+    assert (caught.value.code, caught.value.extra["state"]) == ("stale", state)
+
+
 def test_an_accepted_target_comes_back_when_nothing_is_heard() -> None:
     ledger = Ledger(claim_s=60)
     assert ledger.apply("a", 1, "accepted", 0, visible=True, now=0) == "removed"
@@ -332,7 +347,9 @@ def test_what_is_sent_is_the_result_that_was_looked_at() -> None:
     assert [line.get("seq") for line in lines if line["op"] == "targets"] == [2, 3]
 
 
-def test_a_client_whose_name_another_took_says_nothing_more_in_that_name() -> None:
+def test_a_client_whose_name_another_took_says_nothing_more_in_that_name(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     """Its bye may wait for a kernel that takes no line, while lines of it are read."""
     clock = FakeClock()
     hub = Hub(Settings(), clock)
@@ -340,6 +357,7 @@ def test_a_client_whose_name_another_took_says_nothing_more_in_that_name() -> No
     before, after = JsonSession(hub, 1), JsonSession(hub, 2)
     for session in (before, after):
         session.handle(b'{"op":"hello","version":"1.0","mode":"request","name":"r"}', clock.now)
+    assert caplog.text.count("a robot calls itself 'r' as another connection does") == 1
     accept = b'{"op":"ack","id":1,"target":"m0","result":"accepted"}'
     assert before.handle(accept, clock.now) is None
     assert not hub.ledger.hides(0)
