@@ -52,6 +52,15 @@ def test_what_is_stale_is_shown_as_such() -> None:
         assert "code=stale" in done.output
 
 
+def test_targets_that_came_too_late_are_not_acknowledged(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(RobotClient, "too_late", lambda *_: True)
+    with bench() as b:
+        b.publish()
+        done = robot("client", f"127.0.0.1:{b.port}", "--count", 1, "--ack", "accepted")
+        assert "late on the way: no longer valid" in done.output
+        assert not b.hub.ledger.hides(0)
+
+
 def test_it_tries_again_when_the_server_goes_away(monkeypatch: pytest.MonkeyPatch) -> None:
     with bench() as b:
         b.publish()

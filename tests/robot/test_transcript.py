@@ -176,6 +176,17 @@ def test_a_full_disk_ends_the_transcript_and_nothing_else(
     assert "No space left on device" in caplog.text
 
 
+def test_where_no_client_said_anything_one_must_be_named(tmp_path: Path) -> None:
+    path = tmp_path / "robot.mcap"
+    log = Transcript(path, FakeClock())
+    for client in (1, 2):
+        log.observe("tx", client, b'{"op":"hello"}')
+    log.close()
+    with pytest.raises(InputError, match="no client said anything; choose one with --client"):
+        lines_of(path)
+    assert [(line.client, line.text) for line in lines_of(path, 2)[0]] == [(2, b'{"op":"hello"}')]
+
+
 def test_a_recording_without_a_transcript(tmp_path: Path) -> None:
     path = Path(__file__).parents[2] / "recordings/first-bed.mcap"
     with pytest.raises(InputError, match="no transcript"):
