@@ -8,8 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from mushpipe import Camera
 from mushpipe.core.errors import DeviceError, UsageError
+from mushpipe.sources.realsense_device import find_device, info
 from mushpipe.sources.realsense_frames import CLOCK_TOPIC, LOST, UNPAIRED, Domain
-from tests.live.rig import COLOR, DEPTH, SYSTEM, UNITS, Rig
+from tests.live.rig import COLOR, DEPTH, SERIAL, SYSTEM, UNITS, Rig
 
 
 def receive(rig: Rig, numbers, **settings):
@@ -230,6 +231,8 @@ def test_of_two_cameras_the_serial_number_chooses():
     other.device.add_to(rig.context)
     with pytest.raises(UsageError, match=r"set source\.serial: .* 42, .* 617203001234$"):
         rig.source().open()
+    for serial in ("42", SERIAL):
+        assert info(find_device(rig.context, serial))["serial_number"] == serial
 
 
 def test_the_filters_of_librealsense_run_before_alignment(caplog):
