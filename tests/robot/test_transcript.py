@@ -91,6 +91,7 @@ def test_a_server_is_replayed_to_a_client_and_never_taken_for_live(tmp_path: Pat
     thread.start()
     with RobotClient(port=port.get(timeout=PATIENCE_S), accept_replay=True) as robot:
         assert robot.hello["replay"]
+        robot.send("heartbeat")  # is no request, and gets no answer
         answer = robot.ask("get_targets", max=2)
         assert answer["replay"]
         assert answer["id"] == 1
