@@ -71,6 +71,21 @@ def test_depth_is_aligned_to_colour_as_an_independent_projection_says(shift, tur
     assert np.median(np.abs(seen * UNITS - expected)[inner]) > 0.004
 
 
+def test_what_is_beyond_the_scale_of_depth_is_missing_also_where_it_is_moved():
+    """The last value of 16 bits is no measurement, and none comes of it in a turned camera."""
+    rig = Rig(depth=COLOR, shift=(0.0, 0.0, -0.004), turn=(0.02, -0.03, 0.0))
+    source = rig.source()
+    source.open()
+    frames, found = source.frames(), []
+    for number, value in enumerate((2**16 - 1, 4000)):
+        depth = np.full((COLOR.height, COLOR.width), value, np.uint16)
+        rig.feed(number, rig.images(number) | {"depth": depth})
+        found.append(np.isfinite(next(frames).depth_m).mean())
+    source.close()
+    assert found[0] == 0
+    assert found[1] > 0.9
+
+
 def scaled(camera: Camera, by: int = 4) -> Camera:
     lens = (camera.model, camera.coefficients)
     sizes = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
