@@ -248,3 +248,14 @@ def test_color_that_cannot_be_read_is_named(image: Any, message: str, tmp_path: 
     assert f"not all can be decoded: {COLOR}: {message}" in str(error)
     assert "damaged" not in str(error)
     assert source.counts() == {"images that could not be decoded": 1}
+
+
+def test_of_several_images_that_cannot_be_read_the_first_is_named(tmp_path: Path) -> None:
+    first, second = (raw_image(RGB, encoding) for encoding in ("bayer_rggb8", "bayer_bggr8"))
+    entries = [color_at(0), (COLOR, T0 + 1, first), (COLOR, T0 + 2, second)]
+    source = McapSource(path=write_bag(tmp_path, entries))
+    frames, error = drain(source)
+    assert len(frames) == 1
+    assert "'bayer_rggb8' is not known" in str(error)
+    assert "bayer_bggr8" not in str(error)
+    assert source.counts() == {"images that could not be decoded": 2}
