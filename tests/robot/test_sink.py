@@ -222,10 +222,14 @@ def sensor_at(stamp_ns: int, domain: Domain) -> dict[str, SensorClock]:
 
 
 @pytest.mark.parametrize("domain", Domain)
-def test_a_picture_that_waited_in_the_camera_is_old(sink: RobotJsonSink, domain: Domain) -> None:
+def test_a_picture_that_waited_in_the_camera_is_old(
+    sink: RobotJsonSink, domain: Domain, caplog: pytest.LogCaptureFixture
+) -> None:
     clock = live_clock(sink)
     found = []
+    late = "frames come later than the quickest did, by more than 'max_age_ms'"
     for waited in (0.0, 0.0, 0.1, 3.0):
+        assert late not in caplog.text
         clock.now += 1
         stamp = clock.wall_ns()
         clock.now += waited
@@ -233,6 +237,8 @@ def test_a_picture_that_waited_in_the_camera_is_old(sink: RobotJsonSink, domain:
         found.append(age_of(sink, frame_at(stamp, clock.wall_ns()), attached))
     assert found[1:] == pytest.approx([0, 100, 3000], abs=2)
     assert found[0] == (None if domain == Domain.HARDWARE else 0)
+    # of other clocks their stamps tell it
+    assert (late in caplog.text) == (domain == Domain.HARDWARE)
 
 
 def test_the_cameras_clock_counts_at_the_other_end_of_a_stream(sink: RobotJsonSink) -> None:
