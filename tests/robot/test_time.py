@@ -261,6 +261,15 @@ def test_what_waits_while_a_clock_is_set_or_at_the_start_is_never_called_fresh(
     assert late <= 0.1 or emptied > 28
 
 
+def test_a_camera_that_was_lost_is_not_late_for_what_its_clock_shows_now() -> None:
+    """It goes on, but 400 s further behind ours; that its stamps have another zero says so."""
+    lateness = Lateness()
+    for moment in (100, 101, 102):
+        assert lateness.of(1e3 * moment, 10**9 * moment, moment) == (inf if moment < 101 else 0)
+    found = [lateness.of(1e3 * own, 10**18 + 10**9 * own, own + 400) for own in (103, 104, 105)]
+    assert found == [inf, 0, 0]
+
+
 class Ageing(FakeClock):
     """A clock of a computer on which looking at it takes a millisecond."""
 
