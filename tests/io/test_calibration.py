@@ -101,10 +101,13 @@ def test_intrinsics_may_be_given(tmp_path: Path, caplog: pytest.LogCaptureFixtur
         ("rational_polynomial", "rational", 8),
     ],
 )
-def test_distortion_is_kept(tmp_path: Path, wire: str, model: str, count: int) -> None:
+def test_distortion_is_kept(
+    tmp_path: Path, wire: str, model: str, count: int, caplog: pytest.LogCaptureFixture
+) -> None:
     d = (0.1, -0.2, 0.001, 0.002, 0.05, 0.03, 0.02, 0.01)[:count]
     expected = Camera(WIDTH, HEIGHT, FX, FY, CX, CY, model, d)
     assert cameras(tmp_path, [info_at(0, d=d, model=wire), *COLORS]) == [expected] * 3
+    assert "is not applied" not in caplog.text
 
 
 @pytest.mark.parametrize("length", [4, 5, 8, 12, 14])
