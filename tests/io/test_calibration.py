@@ -249,14 +249,14 @@ def test_a_part_of_the_sensor_and_binning_are_as_image_geometry_has_them(
     np.testing.assert_allclose(seen, [(u - left) / across, (v - top) / down])
 
 
+@pytest.mark.parametrize(("left", "top"), [(3, 0), (0, 2)])
 def test_a_part_beyond_its_image_is_refused(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    left: int, top: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A driver that gives the size of the part, and perhaps its matrix: nobody can tell."""
-    source = McapSource(
-        path=write_bag(tmp_path, [(COLOR_INFO, T0, camera_info(roi=(3, 2, 8, 6))), *COLORS])
-    )
-    with pytest.raises(InputError, match=r"roi, 8x6 from \(3, 2\) on, lies beyond"):
+    info = camera_info(roi=(left, top, 8, 6))
+    source = McapSource(path=write_bag(tmp_path, [(COLOR_INFO, T0, info), *COLORS]))
+    with pytest.raises(InputError, match=rf"roi, 8x6 from \({left}, {top}\) on, lies beyond"):
         list(source.frames())
     assert "has no calibration" in caplog.text
 
