@@ -88,7 +88,7 @@ class Transcript:
 
     def _pass_on(self) -> bool:
         """Write what comes for a while, then make it safe; False at the end."""
-        written, until = 0, self._clock.monotonic() + FLUSH_S
+        until = self._clock.monotonic() + FLUSH_S
         with suppress(Empty):
             while (left := until - self._clock.monotonic()) > 0:
                 item = self._queue.get(timeout=left)
@@ -96,11 +96,9 @@ class Transcript:
                     return False
                 self._note_gap(*item)
                 self._write(*item)
-                written += 1
                 with self._lock:
                     self._waiting -= len(item[0].text)
-        if written:
-            self._writer.flush()
+        self._writer.flush()  # of nothing, this writes nothing
         return True
 
     def _note_gap(self, line: Line, wall_ns: int) -> None:

@@ -224,7 +224,7 @@ class Player:
         return self._with_beside(frame)
 
     def _watch_size(self, size: tuple[int, ...], sequence: int) -> None:
-        if self._size not in (None, size) and self._size:
+        if self._size and self._size != size:
             old, new = (f"{s[1]}x{s[0]}" for s in (self._size, size))
             logger.warning("the frame size changes from %s to %s at frame %d", old, new, sequence)
         self._first, self._size = self._first or size, size

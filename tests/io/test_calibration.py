@@ -6,8 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import foxglove
 import numpy as np
 import pytest
+from foxglove.channels import CameraCalibrationChannel, RawImageChannel
+from foxglove.messages import CameraCalibration
 
 from mushpipe.core.errors import InputError
 from mushpipe.core.geometry import Camera
@@ -34,6 +37,7 @@ from tests.io.bags import (
     depth_pixels,
     drain,
     encoded,
+    foxglove_entries,
     play,
     raw_image,
     write_bag,
@@ -97,10 +101,13 @@ def test_intrinsics_may_be_given(tmp_path: Path, caplog: pytest.LogCaptureFixtur
         ("rational_polynomial", "rational", 8),
     ],
 )
-def test_distortion_is_kept(tmp_path: Path, wire: str, model: str, count: int) -> None:
+def test_distortion_is_kept(
+    tmp_path: Path, wire: str, model: str, count: int, caplog: pytest.LogCaptureFixture
+) -> None:
     d = (0.1, -0.2, 0.001, 0.002, 0.05, 0.03, 0.02, 0.01)[:count]
     expected = Camera(WIDTH, HEIGHT, FX, FY, CX, CY, model, d)
     assert cameras(tmp_path, [info_at(0, d=d, model=wire), *COLORS]) == [expected] * 3
+    assert "is not applied" not in caplog.text
 
 
 @pytest.mark.parametrize("length", [4, 5, 8, 12, 14])
@@ -242,14 +249,14 @@ def test_a_part_of_the_sensor_and_binning_are_as_image_geometry_has_them(
     np.testing.assert_allclose(seen, [(u - left) / across, (v - top) / down])
 
 
+@pytest.mark.parametrize(("left", "top"), [(3, 0), (0, 2)])
 def test_a_part_beyond_its_image_is_refused(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    left: int, top: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A driver that gives the size of the part, and perhaps its matrix: nobody can tell."""
-    source = McapSource(
-        path=write_bag(tmp_path, [(COLOR_INFO, T0, camera_info(roi=(3, 2, 8, 6))), *COLORS])
-    )
-    with pytest.raises(InputError, match=r"roi, 8x6 from \(3, 2\) on, lies beyond"):
+    info = camera_info(roi=(left, top, 8, 6))
+    source = McapSource(path=write_bag(tmp_path, [(COLOR_INFO, T0, info), *COLORS]))
+    with pytest.raises(InputError, match=rf"roi, 8x6 from \({left}, {top}\) on, lies beyond"):
         list(source.frames())
     assert "has no calibration" in caplog.text
 
@@ -340,6 +347,25 @@ def test_rectified_images_have_the_projection_matrix_and_no_distortion(
         message = compressed(encoded(color_pixels(0), ".png"), "rgb8; png compressed bgr8")
     entries = [(f"{topic.partition('/image')[0]}/camera_info", T0, info), (topic, T0, message)]
     assert cameras(tmp_path, entries) == [Camera(WIDTH, HEIGHT, 500.0, 510.0, 3.0, 2.0)]
+
+
+def test_rectified_images_of_a_foxglove_recording_have_the_projection_matrix(
+    tmp_path: Path,
+) -> None:
+    path, context = tmp_path / "f.mcap", foxglove.Context()
+    _, (_, _, image), *_ = foxglove_entries(1)
+    info = CameraCalibration(
+        width=WIDTH,
+        height=HEIGHT,
+        distortion_model="plumb_bob",
+        D=[0.1, 0, 0, 0, 0],
+        K=[FX, 0, CX, 0, FY, CY, 0, 0, 1],
+        P=[500.0, 0, 3, 0, 0, 510.0, 2, 0, 0, 0, 1, 0],
+    )
+    with foxglove.open_mcap(path, context=context):
+        CameraCalibrationChannel("/rect/camera_info", context=context).log(info, log_time=T0)
+        RawImageChannel("/rect/image", context=context).log(image, log_time=T0)
+    assert [frame.camera for frame in play(path)] == [Camera(WIDTH, HEIGHT, 500.0, 510.0, 3.0, 2.0)]
 
 
 def test_a_given_camera_takes_the_place_of_one_that_cannot_be_decoded(tmp_path: Path) -> None:

@@ -178,6 +178,38 @@ def test_a_client_of_the_websocket_protocol_gets_frames_and_picks() -> None:
         sink.close()
 
 
+def test_where_the_camera_hangs_is_told_where_the_graph_says_it() -> None:
+    base = {"frame": "base", "translation": [0.4, -0.1, 0.9], "quaternion": [0.6, 0.0, 0.0, 0.8]}
+    stages = {"pick": {"use": "picks", "T_base_camera": base}}
+    sink = FoxgloveSink(port=0)
+    sink.open(RunInfo("bed", {"graph": {"stages": stages}}))
+    try:
+        sink.consume(trace_of(make_frame(), pick=make_picks()))
+        address = f"ws://127.0.0.1:{sink._server.port}"
+        with connect(address, subprotocols=["foxglove.sdk.v1"], max_size=None) as client:
+            told = advertised(client, {wire.TIMING_TOPIC})[wire.BASE_TOPIC]
+            assert told["schemaName"] == "foxglove.FrameTransform"
+    finally:
+        sink.close()
+
+
+def test_a_frame_without_depth_and_calibration_is_sent() -> None:
+    sink = FoxgloveSink(port=0)
+    sink.open(RunInfo("bed", {}))
+    try:
+        sink.consume(trace_of(make_frame(depth=None, camera=None), detect=make_circles()))
+        address = f"ws://127.0.0.1:{sink._server.port}"
+        with connect(address, subprotocols=["foxglove.sdk.v1"], max_size=None) as client:
+            assert set(advertised(client, {wire.TIMING_TOPIC})) == {
+                wire.COLOR_TOPIC,
+                "/mushpipe/detect",
+                "/mushpipe/detect/annotations",
+                wire.TIMING_TOPIC,
+            }
+    finally:
+        sink.close()
+
+
 def test_frames_that_nobody_asked_for_are_not_made(monkeypatch: pytest.MonkeyPatch) -> None:
     sink, made = FoxgloveSink(port=0), list[str]()
     sink.open(RunInfo("bed", {}))

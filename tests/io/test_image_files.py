@@ -237,6 +237,13 @@ def test_depth_is_no_colour_and_a_damaged_file_no_image(tmp_path: Path) -> None:
         played(tmp_path)
 
 
+def test_a_file_of_several_images_is_refused(tmp_path: Path) -> None:
+    pages = [np.full((*SIZE, 3), value, np.uint8) for value in (10, 20)]
+    assert cv2.imwritemulti(str(tmp_path / "0.tiff"), pages)
+    with pytest.raises(InputError, match=r"0\.tiff: it holds several images: make a file of each"):
+        played(tmp_path)
+
+
 def test_a_camera_holds_for_images_of_one_size(tmp_path: Path) -> None:
     write(tmp_path / "0.png", 1)
     cv2.imwrite(str(tmp_path / "1.png"), np.zeros((12, 16, 3), np.uint8))

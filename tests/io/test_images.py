@@ -237,6 +237,7 @@ def test_a_unit_from_the_user_makes_mono16_readable(tmp_path: Path) -> None:
         (raw_image(RGB, "bayer_rggb8"), "colour encoding 'bayer_rggb8' is not known (known: rgb8"),
         (raw_image(GRAY, "rgb8"), "8x6 image with step 8 in 48 bytes, rgb8 needs 3 bytes a pixel"),
         (raw_image(RGB, "rgb8", data=b""), "8x6 image with step 24 in 0 bytes"),
+        (raw_image(RGB[:, :0], "rgb8"), "0x6 image with step 0 in 0 bytes"),
         (raw_image(np.zeros((6, 7, 2), np.uint8), "yuv422"), "yuv422 image of odd width 7"),
     ],
 )
@@ -247,3 +248,14 @@ def test_color_that_cannot_be_read_is_named(image: Any, message: str, tmp_path: 
     assert f"not all can be decoded: {COLOR}: {message}" in str(error)
     assert "damaged" not in str(error)
     assert source.counts() == {"images that could not be decoded": 1}
+
+
+def test_of_several_images_that_cannot_be_read_the_first_is_named(tmp_path: Path) -> None:
+    first, second = (raw_image(RGB, encoding) for encoding in ("bayer_rggb8", "bayer_bggr8"))
+    entries = [color_at(0), (COLOR, T0 + 1, first), (COLOR, T0 + 2, second)]
+    source = McapSource(path=write_bag(tmp_path, entries))
+    frames, error = drain(source)
+    assert len(frames) == 1
+    assert "'bayer_rggb8' is not known" in str(error)
+    assert "bayer_bggr8" not in str(error)
+    assert source.counts() == {"images that could not be decoded": 2}

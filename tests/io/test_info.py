@@ -13,6 +13,7 @@ from pydantic import Field
 
 from mushpipe import Circles, Mask, Registry, RgbdFrame, Sink, Stage
 from mushpipe.core.errors import InputError, PluginError
+from mushpipe.core.group import Group
 from mushpipe.core.plugins import Broken
 from mushpipe.info import describe, describe_plugin, plugin_rows, render, render_plugins
 from tests.io.bags import ALIGNED, COLOR, COLOR_INFO, PERIOD, T0, rgbd, write_bag, write_foxglove
@@ -115,6 +116,12 @@ class Side(Enum):
     right = "right"
 
 
+class Edge(Group):
+    """How an edge is found."""
+
+    width: int | None = Field(None, ge=1, description="width, px")
+
+
 class Threshold(Stage):
     """Calls bright what is brighter than a level.
 
@@ -125,6 +132,8 @@ class Threshold(Stage):
     band: tuple[int, int] = Field(description="rows, px")
     mode: Literal["fast", "exact"] = Field("fast", description="how")
     side: Side = Field(Side.left, description="where")
+    names: list[str] = Field([], description="which")
+    edge: Edge = Field(Edge(), description="the edge")
 
     def process(self, frame: RgbdFrame, mask: Mask | None = None) -> tuple[Mask, Circles]:
         raise NotImplementedError
@@ -169,12 +178,15 @@ def test_every_plugin_of_a_name_is_described() -> None:
     assert "The level is a share of white." in lines
     assert "inputs   frame: RgbdFrame, mask: Mask (optional)" in lines
     assert "outputs  Mask, Circles" in lines
-    assert [re.split(r"  +", line) for line in lines[-5:]] == [
+    assert [re.split(r"  +", line) for line in lines[-8:]] == [
         ["setting", "type", "default", "meaning"],
         ["level", "number > 0 <= 1", "0.5", "share of white"],
         ["band", "[integer, integer]", "required", "rows, px"],
         ["mode", "fast | exact", '"fast"', "how"],
         ["side", "left | right", '"left"', "where"],
+        ["names", "list of string", "[]", "which"],
+        ["edge", "Edge", "the edge"],
+        ["edge.width", "integer >= 1 | null", "null", "width, px"],
     ]
     assert sink.splitlines()[-1] == "outputs  none"
 

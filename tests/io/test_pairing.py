@@ -189,6 +189,42 @@ def test_where_halves_of_a_file_changed_places_it_is_said(
     assert f"stamps go back by {5 * PERIOD / 1e9:.3f} s at frame 3; frames are played in" in said[0]
 
 
+@pytest.mark.parametrize(
+    ("arriving", "pairs", "alone"),
+    [
+        ("c1000 d1004 c1004", [(1000, None), (1004, 1004)], (1, 0)),
+        ("c1000 c1004 d1001", [(1000, 1001), (1004, None)], (1, 0)),
+        ("d1002 c1000 c1004", [(1000, 1002), (1004, None)], (1, 0)),  # as near to either
+        # Clocks that were set back:
+        ("d1000 d510 c543 d543", [(543, 543)], (0, 2)),
+        ("c1000 d1002 d962", [(1000, 1002)], (0, 1)),
+    ],
+)
+def test_depth_belongs_to_the_nearest_colour(
+    arriving: str, pairs: list[tuple[int, int | None]], alone: tuple[int, int]
+) -> None:
+    pairing: Pairing[int, int] = Pairing(5)
+    found = []
+    for item in arriving.split():
+        stamp = int(item[1:])
+        found += (pairing.add_color if item[0] == "c" else pairing.add_depth)(stamp, stamp)
+    found += pairing.finish()
+    assert found == pairs
+    assert (pairing.color_alone, pairing.depth_alone) == alone
+
+
+@pytest.mark.parametrize("arriving", ["c1000 d1000", "c1000 d1001 c1033", "d998 c1000 d1031"])
+def test_a_pair_waits_for_no_more_than_what_could_change_it(arriving: str) -> None:
+    pairing: Pairing[int, int] = Pairing(5)
+    waiting = True
+    for item in arriving.split():
+        assert waiting
+        stamp = int(item[1:])
+        add = pairing.add_color if item[0] == "c" else pairing.add_depth
+        waiting = not list(add(stamp, stamp))
+    assert not waiting
+
+
 def test_depth_without_colour_for_long_is_not_kept() -> None:
     pairing: Pairing[str, int] = Pairing(0)
     for stamp in range(1000):

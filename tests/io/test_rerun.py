@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from mushpipe import Circles, Mask, Picks, RunInfo
 from mushpipe.core.recorder import RecordingError
 from mushpipe.sinks import rerun as module
+from mushpipe.sinks import rerun_layout as at
 from mushpipe.sinks.rerun import ROOM_BYTES, RerunSink
 from tests.io.bags import FX, FY, OPTICAL, PERIOD, T0, depth_pixels
 from tests.io.rerun_file import IMAGE, read, show, unpack, values
@@ -96,6 +97,12 @@ def test_depth_in_metres_with_gaps_is_shown(tmp_path: Path) -> None:
         stored = np.array(data, np.uint8).view(np.float32).reshape(24, 32)
         np.testing.assert_array_equal(stored, depth)
         assert values(found, f"{IMAGE}/depth", "meter") == [[1.0]]
+
+
+def test_depth_without_a_calibration_is_an_image_and_no_cloud(tmp_path: Path) -> None:
+    found = show(tmp_path, [trace_of(make_frame(camera=None))])
+    assert values(found, f"{IMAGE}/depth", "meter") == [[8000.0]]
+    assert f"/{at.CLOUD}" not in found
 
 
 def test_the_pinhole_is_that_of_the_camera(tmp_path: Path) -> None:

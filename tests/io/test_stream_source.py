@@ -9,6 +9,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -26,12 +27,14 @@ from mushpipe.core.errors import (
 )
 from mushpipe.core.paths import STDIO
 from mushpipe.core.recorder import RecordingWriter
-from mushpipe.core.recording import MANIFEST
-from mushpipe.core.wire import COLOR_TOPIC, DEPTH_TOPIC, Message, Schema
+from mushpipe.core.recording import MANIFEST, Raw, RecordingReader
+from mushpipe.core.wire import CAMERA_TOPIC, COLOR_TOPIC, DEPTH_TOPIC, Message, Schema
 from mushpipe.sources import stream as module
 from mushpipe.sources.mcap import McapSource
-from mushpipe.sources.realsense_frames import Clock
+from mushpipe.sources.playing import Player
+from mushpipe.sources.realsense_frames import CLOCK_TOPIC, Clock, Domain, clock_of
 from mushpipe.sources.stream import StreamSource
+from mushpipe.sources.topics import Topics
 from tests.cli.test_record import CAMERA, picture
 from tests.core.lab import Lab, held, soon
 
@@ -359,6 +362,38 @@ def test_a_saved_stream_in_which_a_bit_is_flipped_is_reported(tmp_path: Path) ->
     for source in (McapSource(path=path), opened(path)):
         with pytest.raises(InputError, match=r"its CRC does not match\)?; 3 frames"):
             list(source.frames())
+
+
+def test_what_a_sensor_said_of_a_frame_is_known_at_the_other_end(tmp_path: Path) -> None:
+    path = tmp_path / "s.mcap"
+    writer = RecordingWriter(path, {MANIFEST: {"json": "{}"}})
+    for number in (7, 9):
+        header = Header(10**18 + number * 33_000_000, number, "c")
+        clock = Clock(np.array([number]), np.array([1000.25 * number]), np.array([Domain.GLOBAL]))
+        writer.frame(RgbdFrame(header, picture(0)[0], attached={CLOCK_TOPIC: clock}))
+    writer.close()
+    for source in (McapSource(path=path), opened(path)):
+        clocks = [clock_of(frame) for frame in source.frames()]
+        told = [(c.number.item(), c.time_ms.item(), c.domain.item()) for c in clocks if c]
+        assert told == [(7, 7001.75, Domain.GLOBAL), (9, 9002.25, Domain.GLOBAL)]
+
+
+def test_a_frame_of_a_stream_does_not_wait_for_the_next_one(tmp_path: Path) -> None:
+    """Of a recording it does: what belongs to it may stand behind its images."""
+    path, taken = stream(tmp_path / "s.mcap", 3), list[str]()
+
+    def messages() -> Iterator[Raw]:
+        for raw in RecordingReader(path).messages(set(vars(topics).values())):
+            taken.append(raw.channel.topic)
+            yield raw
+
+    topics = Topics(COLOR_TOPIC, DEPTH_TOPIC, CAMERA_TOPIC)
+    for hold in (False, True):
+        taken.clear()
+        player = Player(StreamSource(), "s", topics, set(), True, Counter())
+        assert next(player.play(messages(), hold)).header.sequence == 7
+        images = [topic for topic in taken if topic != CAMERA_TOPIC]
+        assert images == [COLOR_TOPIC, DEPTH_TOPIC] + [COLOR_TOPIC] * hold
 
 
 def send() -> None:

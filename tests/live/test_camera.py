@@ -8,8 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from mushpipe import Camera
 from mushpipe.core.errors import DeviceError, UsageError
+from mushpipe.sources.realsense_device import find_device, info
 from mushpipe.sources.realsense_frames import CLOCK_TOPIC, LOST, UNPAIRED, Domain
-from tests.live.rig import COLOR, DEPTH, SYSTEM, UNITS, Rig
+from tests.live.rig import COLOR, DEPTH, SERIAL, SYSTEM, UNITS, Rig
 
 
 def receive(rig: Rig, numbers, **settings):
@@ -68,6 +69,21 @@ def test_depth_is_aligned_to_colour_as_an_independent_projection_says(shift, tur
     assert np.nanmax(error) < 0.001
     assert np.nanmedian(error) < 0.0003
     assert np.median(np.abs(seen * UNITS - expected)[inner]) > 0.004
+
+
+def test_what_is_beyond_the_scale_of_depth_is_missing_also_where_it_is_moved():
+    """The last value of 16 bits is no measurement, and none comes of it in a turned camera."""
+    rig = Rig(depth=COLOR, shift=(0.0, 0.0, -0.004), turn=(0.02, -0.03, 0.0))
+    source = rig.source()
+    source.open()
+    frames, found = source.frames(), []
+    for number, value in enumerate((2**16 - 1, 4000)):
+        depth = np.full((COLOR.height, COLOR.width), value, np.uint16)
+        rig.feed(number, rig.images(number) | {"depth": depth})
+        found.append(np.isfinite(next(frames).depth_m).mean())
+    source.close()
+    assert found[0] == 0
+    assert found[1] > 0.9
 
 
 def scaled(camera: Camera, by: int = 4) -> Camera:
@@ -230,6 +246,8 @@ def test_of_two_cameras_the_serial_number_chooses():
     other.device.add_to(rig.context)
     with pytest.raises(UsageError, match=r"set source\.serial: .* 42, .* 617203001234$"):
         rig.source().open()
+    for serial in ("42", SERIAL):
+        assert info(find_device(rig.context, serial))["serial_number"] == serial
 
 
 def test_the_filters_of_librealsense_run_before_alignment(caplog):

@@ -13,7 +13,7 @@ from mushpipe.sources import realsense
 from mushpipe.sources.realsense import RealsenseSource
 from mushpipe.sources.realsense_frames import CLOCK_TOPIC, Domain
 from tests.core.lab import Lab, cli
-from tests.live.rig import COLOR, HARDWARE, UNITS, Rig, acquire
+from tests.live.rig import COLOR, HARDWARE, UNITS, Rig, acquire, rs
 
 N = 60
 
@@ -50,6 +50,16 @@ def test_60_of_60_frames_of_a_recording_are_exact(bag):
     assert frames[0].camera is not None
     assert frames[0].camera.fx == pytest.approx(COLOR.fx)
     assert source.counts() == {}
+
+
+def test_the_arrival_that_was_recorded_is_told(tmp_path):
+    rig = Rig()
+    for sensor, _ in rig.sensors.values():
+        sensor.set_metadata(rs.frame_metadata_value.time_of_arrival, 1_700_000_000_456)  # ms
+    rig.record(tmp_path / "a.bag", [rig.images(i) for i in range(3)])
+    headers = [frame.header for frame in play(tmp_path / "a.bag")[1]]
+    assert headers[0].stamp_ns == pytest.approx(1.7e18, abs=300)
+    assert [header.arrival_ns for header in headers] == [1_700_000_000_456_000_000] * 3
 
 
 def test_playing_twice_gives_the_same(bag):

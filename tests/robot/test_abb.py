@@ -146,6 +146,7 @@ def test_a_target_that_may_be_gone_cannot_be_accepted_any_more() -> None:
         assert robot.ask("ACK,0,ACCEPTED").startswith("E,STALE,")
         assert robot.ask("ACK,1,ACCEPTED") == "A,1,REMOVED"  # it has this one already
         assert robot.ask("ACK,1,DONE") == "A,1,REMOVED"
+        assert robot.ask("ACK,2,DONE") == "A,2,REMOVED"  # what was picked is told at any time
 
 
 def test_it_shares_its_targets_with_json() -> None:

@@ -16,10 +16,12 @@ from typing import Any
 import pytest
 
 from mushpipe.robot.connection import Limits
+from mushpipe.robot.hub import Hub, Settings
 from mushpipe.robot.messages import MAX_LINE
-from mushpipe.robot.server import THROTTLED_S
+from mushpipe.robot.server import THROTTLED_S, Listener, Options, RobotServer
+from mushpipe.robot.session import JsonSession
 from tests.robot.peer import Peer, read_line
-from tests.robot.scene import bench, choice
+from tests.robot.scene import FakeClock, bench, choice
 
 BIG = choice(200)
 MANY = Limits(lines_per_s=1e9)
@@ -81,6 +83,14 @@ def test_a_client_that_floods_bad_lines_and_never_reads_is_not_kept() -> None:
         dead.greet()
         fill(dead.sock, b"x\n" * 10_000)
         assert b"it does not read" in b.advance_until_disconnected(2.1)
+
+
+def test_a_server_that_never_served_gives_its_port_back() -> None:
+    hub = Hub(Settings(), FakeClock())
+    server = RobotServer(hub, Options([Listener("127.0.0.1", 0, JsonSession)]))
+    server.stop()
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", server.ports[0]))
 
 
 def test_nothing_waits_for_an_absent_robot() -> None:

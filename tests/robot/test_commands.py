@@ -10,7 +10,7 @@ import threading
 import time
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 from typer.testing import CliRunner
@@ -50,6 +50,57 @@ def test_what_is_stale_is_shown_as_such() -> None:
     with bench() as b:
         done = robot("client", f"127.0.0.1:{b.port}", "--count", 1)
         assert "code=stale" in done.output
+
+
+def test_targets_that_came_too_late_are_not_acknowledged(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(RobotClient, "too_late", lambda *_: True)
+    with bench() as b:
+        b.publish()
+        done = robot("client", f"127.0.0.1:{b.port}", "--count", 1, "--ack", "accepted")
+        assert "late on the way: no longer valid" in done.output
+        assert not b.hub.ledger.hides(0)
+
+
+class Said:
+    """A connection on which these lines come."""
+
+    hello: ClassVar[dict[str, str]] = {"software": "mushpipe"}
+
+    def __init__(self, *lines: dict[str, Any]) -> None:
+        self.lines, self.pings = iter(lines), 0
+
+    def receive(self) -> dict[str, Any]:
+        return next(self.lines)
+
+    def ping(self) -> None:
+        self.pings += 1
+
+    def too_late(self, message: dict[str, Any]) -> bool:
+        return False
+
+
+def test_of_a_stream_results_alone_count_and_a_heartbeat_is_answered(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    beat = {"op": "heartbeat", "state": "running"}
+    error = {"op": "error", "code": "busy"}
+    connection = Said(beat, {"op": "pong", "id": 1}, error, beat, error, error)
+    talk = commands._Talk(commands.Mode.stream, {}, 0, [], raw=False, count=2)
+    commands._converse(connection, talk)  # type: ignore[arg-type]
+    assert connection.pings == 2
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == [
+        "heartbeat",
+        "error",
+        "heartbeat",
+        "error",
+    ]
+
+
+def test_a_server_that_takes_its_leave_is_tried_again() -> None:
+    connection = Said({"op": "bye", "reason": "end"})
+    talk = commands._Talk(commands.Mode.stream, {}, 0, [], raw=False, count=2)
+    with pytest.raises(ConnectionError, match="the server says bye: end"):
+        commands._converse(connection, talk)  # type: ignore[arg-type]
 
 
 def test_it_tries_again_when_the_server_goes_away(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -108,6 +108,17 @@ def test_an_orientation_that_is_missing_without_a_flag_is_flagged() -> None:
     assert target["flags"] == ["pose_unknown"]
 
 
+def test_directions_of_nearly_length_1_leave_with_it_and_others_not_at_all() -> None:
+    turn, up = np.array([0, 0, 0.6, 0.8]), np.array([0, 0, 1.0])
+    near = make_picks(1, quaternion=[1.0009 * turn], axis=[0.9991 * up])
+    (target,) = decoded(Filter()(near))
+    assert target["orientation"] == [0, 0, 0.6, 0.8]
+    assert target["approach"] == [0, 0, -1]
+    for quaternion, axis in ((1.0011 * turn, up), (turn, 0.9989 * up)):
+        off = Filter()(make_picks(1, quaternion=[quaternion], axis=[axis]))
+        assert (ids(off), off.withheld["invalid"]) == ([], 1)
+
+
 @pytest.mark.parametrize(
     "change",
     [

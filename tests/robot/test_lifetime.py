@@ -207,6 +207,17 @@ def test_the_reference_client_takes_no_targets_from_an_answer_that_was_too_long_
             assert robot.targets() == ([{"id": "m1"}] if still else [])
 
 
+def test_the_reference_client_speaks_to_no_server_of_another_version() -> None:
+    lines: list[dict[str, Any]] = [
+        {"op": "hello", "version": "2.0", "t_ms": 0},
+        {"op": "heartbeat", "t_ms": 0},
+    ]
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        threading.Thread(target=serve_lines, args=(listening, lines), daemon=True).start()
+        with pytest.raises(PermissionError, match=r"speaks version 2\.0, this client 1\.0"):
+            RobotClient(port=listening.getsockname()[1])
+
+
 def test_a_client_that_is_not_greeted_closes_its_connection() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listening:
         nonsense: list[dict[str, Any]] = [{"no": "op"}]

@@ -54,6 +54,21 @@ def test_a_claim_on_a_mushroom_of_unknown_size_outlives_its_id_as_well() -> None
     assert scene.show(choice(3, id=np.arange(3, 6), position=moved, diameter=size)) == [3, 5]
 
 
+@pytest.mark.parametrize(
+    ("before_m", "after_m", "reach_m"),
+    [(0.08, 0.08, 0.04), (0.08, np.nan, 0.04), (np.nan, 0.08, 0.04), (0.02, 0.02, 0.01)],
+)
+def test_a_claim_reaches_half_the_diameter_of_its_mushroom(
+    before_m: float, after_m: float, reach_m: float
+) -> None:
+    scene = Scene()
+    scene.show(choice(1, diameter=[before_m]))
+    scene.say("a", 0, "accepted")
+    for number, (way_m, offered) in enumerate(((0.9 * reach_m, []), (1.1 * reach_m, [2])), 1):
+        moved = choice(1, id=[number], position=[[0, way_m, 0.5]], diameter=[after_m])
+        assert scene.show(moved) == offered
+
+
 def test_a_claim_that_lapses_hides_nothing_any_more() -> None:
     scene = Scene()
     scene.show(bed(0))
@@ -91,6 +106,15 @@ def test_a_claim_is_where_its_mushroom_was_last_seen() -> None:
     scene.show(bed(0, (0.03, 0, 0)))  # the camera moves
     assert scene.show(bed(3, (0.03, 0, 0))) == [3, 5]
     assert scene.show(bed(6)) == [6, 7, 8]
+
+
+def test_a_claim_follows_its_mushroom_also_through_results_that_nobody_asks_for() -> None:
+    scene = Scene()
+    scene.show(bed(0))
+    scene.say("a", 1, "accepted")
+    scene.hub.publish(bed(0, (0.03, 0, 0)), 0, 0, scene.clock.now)
+    scene.hub.tick(scene.clock.now)
+    assert scene.show(bed(3, (0.03, 0, 0))) == [3, 5]
 
 
 def test_what_is_done_hides_nothing_that_comes_to_light_there() -> None:

@@ -136,13 +136,14 @@ def test_with_a_token_and_tls_the_network_is_served(
     (tmp_path / "token").write_text("t" * 16 + "\n")
     trusting = ssl.create_default_context(cafile=certificate)
     with_token = {"token_file": tmp_path / "token"}
-    with_tls = {"tls_cert": certificate, "tls_client_ca": certificate}
-    for chosen in (with_token, with_tls, with_token | with_tls):
+    with_tls = {"tls_cert": certificate}
+    both_sides = {**with_tls, "tls_client_ca": certificate}
+    for chosen in (with_token, with_tls, both_sides, with_token | both_sides):
         sink = RobotJsonSink.model_validate({"port": 0, **chosen})
         sink.open(LIVE)
         hello = {"token": "t" * 16} if "token_file" in chosen else {}
         context = trusting if "tls_cert" in chosen else None
-        if context:
+        if context and "tls_client_ca" in chosen:
             with pytest.raises(OSError):  # noqa: PT011 - it has no certificate to show
                 RobotClient(port=port(sink), tls=context, **hello)
             context.load_cert_chain(certificate)
@@ -221,10 +222,14 @@ def sensor_at(stamp_ns: int, domain: Domain) -> dict[str, SensorClock]:
 
 
 @pytest.mark.parametrize("domain", Domain)
-def test_a_picture_that_waited_in_the_camera_is_old(sink: RobotJsonSink, domain: Domain) -> None:
+def test_a_picture_that_waited_in_the_camera_is_old(
+    sink: RobotJsonSink, domain: Domain, caplog: pytest.LogCaptureFixture
+) -> None:
     clock = live_clock(sink)
     found = []
+    late = "frames come later than the quickest did, by more than 'max_age_ms'"
     for waited in (0.0, 0.0, 0.1, 3.0):
+        assert late not in caplog.text
         clock.now += 1
         stamp = clock.wall_ns()
         clock.now += waited
@@ -232,6 +237,8 @@ def test_a_picture_that_waited_in_the_camera_is_old(sink: RobotJsonSink, domain:
         found.append(age_of(sink, frame_at(stamp, clock.wall_ns()), attached))
     assert found[1:] == pytest.approx([0, 100, 3000], abs=2)
     assert found[0] == (None if domain == Domain.HARDWARE else 0)
+    # of other clocks their stamps tell it
+    assert (late in caplog.text) == (domain == Domain.HARDWARE)
 
 
 def test_the_cameras_clock_counts_at_the_other_end_of_a_stream(sink: RobotJsonSink) -> None:

@@ -159,6 +159,21 @@ def test_a_recording_has_no_camera_to_lose() -> None:
     assert hub.state(clock.now) == "stalled"
 
 
+@pytest.mark.parametrize(
+    ("ending", "state"), [("end", "stalled"), ("failed", "stalled"), ("no_camera", "no_camera")]
+)
+def test_once_the_run_has_ended_nothing_is_fresh(ending: Ending, state: str) -> None:
+    clock = FakeClock()
+    hub, _ = hub_on(clock)
+    hub.publish(choice(), 0, 0, clock.now)
+    assert hub.state(clock.now) == "running"
+    hub.ending = ending
+    assert hub.state(clock.now) == state
+    with pytest.raises(Refusal) as caught:
+        hub.fresh(clock.now, 10)
+    assert (caught.value.code, caught.value.extra["state"]) == ("stale", state)
+
+
 def test_an_accepted_target_comes_back_when_nothing_is_heard() -> None:
     ledger = Ledger(claim_s=60)
     assert ledger.apply("a", 1, "accepted", 0, visible=True, now=0) == "removed"
@@ -246,6 +261,15 @@ def test_what_waits_while_a_clock_is_set_or_at_the_start_is_never_called_fresh(
     assert late <= 0.1 or emptied > 28
 
 
+def test_a_camera_that_was_lost_is_not_late_for_what_its_clock_shows_now() -> None:
+    """It goes on, but 400 s further behind ours; that its stamps have another zero says so."""
+    lateness = Lateness()
+    for moment in (100, 101, 102):
+        assert lateness.of(1e3 * moment, 10**9 * moment, moment) == (inf if moment < 101 else 0)
+    found = [lateness.of(1e3 * own, 10**18 + 10**9 * own, own + 400) for own in (103, 104, 105)]
+    assert found == [inf, 0, 0]
+
+
 class Ageing(FakeClock):
     """A clock of a computer on which looking at it takes a millisecond."""
 
@@ -292,6 +316,22 @@ def test_what_was_put_off_is_accepted_only_where_it_is_seen() -> None:
     assert ledger.apply("a", 1, "accepted", 0, visible=False, now=1802) == "removed"  # its own
 
 
+def test_only_so_many_targets_are_held_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mushpipe.robot.ledger.MOST_ENTRIES", 3)
+    ledger = Ledger()
+    for target, outcome in ((1, "accepted"), (2, "rejected"), (3, "accepted")):
+        assert ledger.apply("a", target, outcome, 9, visible=True, now=0) == "removed"  # type: ignore[arg-type]
+    with pytest.raises(Refusal) as caught:
+        ledger.apply("b", 4, "accepted", 0, visible=True, now=0)
+    assert caught.value.code == "busy"
+    assert hidden(ledger) == {1, 2, 3}
+    # neither what is held already nor what leaves the list counts as one more
+    assert ledger.apply("a", 1, "accepted", 0, visible=True, now=0) == "removed"
+    assert ledger.apply("b", 5, "done", 0, visible=True, now=0) == "removed"
+    assert ledger.apply("a", 3, "failed", 0, visible=True, now=0) == "restored"
+    assert ledger.apply("b", 4, "accepted", 0, visible=True, now=0) == "removed"
+
+
 class Hasty(Hub):
     """A hub to which a result in another frame comes as soon as one was looked at."""
 
@@ -316,7 +356,9 @@ def test_what_is_sent_is_the_result_that_was_looked_at() -> None:
     assert [line.get("seq") for line in lines if line["op"] == "targets"] == [2, 3]
 
 
-def test_a_client_whose_name_another_took_says_nothing_more_in_that_name() -> None:
+def test_a_client_whose_name_another_took_says_nothing_more_in_that_name(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     """Its bye may wait for a kernel that takes no line, while lines of it are read."""
     clock = FakeClock()
     hub = Hub(Settings(), clock)
@@ -324,6 +366,7 @@ def test_a_client_whose_name_another_took_says_nothing_more_in_that_name() -> No
     before, after = JsonSession(hub, 1), JsonSession(hub, 2)
     for session in (before, after):
         session.handle(b'{"op":"hello","version":"1.0","mode":"request","name":"r"}', clock.now)
+    assert caplog.text.count("a robot calls itself 'r' as another connection does") == 1
     accept = b'{"op":"ack","id":1,"target":"m0","result":"accepted"}'
     assert before.handle(accept, clock.now) is None
     assert not hub.ledger.hides(0)

@@ -91,6 +91,7 @@ def test_a_server_is_replayed_to_a_client_and_never_taken_for_live(tmp_path: Pat
     thread.start()
     with RobotClient(port=port.get(timeout=PATIENCE_S), accept_replay=True) as robot:
         assert robot.hello["replay"]
+        robot.send("heartbeat")  # is no request, and gets no answer
         answer = robot.ask("get_targets", max=2)
         assert answer["replay"]
         assert answer["id"] == 1
@@ -174,6 +175,17 @@ def test_a_full_disk_ends_the_transcript_and_nothing_else(
     log.close()
     assert log.lost == 1
     assert "No space left on device" in caplog.text
+
+
+def test_where_no_client_said_anything_one_must_be_named(tmp_path: Path) -> None:
+    path = tmp_path / "robot.mcap"
+    log = Transcript(path, FakeClock())
+    for client in (1, 2):
+        log.observe("tx", client, b'{"op":"hello"}')
+    log.close()
+    with pytest.raises(InputError, match="no client said anything; choose one with --client"):
+        lines_of(path)
+    assert [(line.client, line.text) for line in lines_of(path, 2)[0]] == [(2, b'{"op":"hello"}')]
 
 
 def test_a_recording_without_a_transcript(tmp_path: Path) -> None:

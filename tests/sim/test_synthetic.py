@@ -174,6 +174,7 @@ def test_missing_depth_and_a_gap_in_time():
         {"sensor": {"nois": 1}},
         {"color": {"jpeg_quality": 101}},
         {"lamps": 3},
+        {"step_mm": 5, "travel_mm": 0},
         {"width": 64, "height": 240, "camera_tilt_deg": 20},
     ],
 )
