@@ -60,7 +60,6 @@ def record(
     import logging
 
     from mushpipe.console import execute, set_up_logging
-    from mushpipe.core.errors import UsageError
     from mushpipe.core.paths import STDIO
 
     set_up_logging(False)
@@ -71,8 +70,6 @@ def record(
     settings = {"path": str(out), "timing": False, "overwrite": False}
     settings |= {"jpeg_quality": JPEG_QUALITY} if colour is Colour.jpeg else {}
     settings |= {"split_size": split_size} if split_size is not None else {}
-    if out == STDIO and split_size is not None:
-        raise UsageError("--split-size: a stream cannot be split")
     plan = _compile(settings, [*limits, *(set_ or [])], source)
     for text in plan.warnings:
         logging.getLogger("mushpipe").warning(text)

@@ -9,7 +9,7 @@ from itertools import count, takewhile
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from pydantic import ByteSize, Field, PrivateAttr, field_validator
+from pydantic import ByteSize, Field, PrivateAttr, ValidationInfo, field_validator
 
 from mushpipe import RunInfo, Sink, SinkPath, Trace
 from mushpipe.core.errors import MushpipeError, UsageError
@@ -63,6 +63,13 @@ class McapSink(Sink):
             raise ValueError("a recording is MCAP, and .bag one of Intel's viewer: name it .mcap")
         return path
 
+    @field_validator("split_size")
+    @classmethod
+    def _of_a_file(cls, size: ByteSize | None, known: ValidationInfo) -> ByteSize | None:
+        if size is not None and known.data.get("path") == STDIO:
+            raise ValueError("standard output is one stream, which cannot be split")
+        return size
+
     def files(self, run: RunInfo) -> tuple[Path, ...]:
         """Return the files it writes; of a split recording the first one and all there are."""
         if self.path == STDIO:
@@ -83,7 +90,7 @@ class McapSink(Sink):
             UsageError: Of a split recording there is a later part without the first.
         """
         self._run, self._part, self._ended = run, 0, None
-        if self.split_size is not None and self.path != STDIO and self.overwrite:
+        if self.split_size is not None and self.overwrite:
             self._clear(run.path(self.path))
         self._base = base_of(run.manifest.get("graph", {}))
         self._writer = self._begin(run)
@@ -101,7 +108,7 @@ class McapSink(Sink):
 
     def _begin(self, run: RunInfo) -> RecordingWriter:
         path = self.path if self.path == STDIO else run.path(self.path)
-        if self.split_size is not None and path != STDIO:
+        if self.split_size is not None:
             path = part(path, self._part)
         manifest = {"json": json.dumps(dict(run.manifest))}
         if path == STDIO and run.live:
@@ -128,7 +135,7 @@ class McapSink(Sink):
             raise self._ended
         if writer is None or run is None:
             raise RuntimeError("the sink is not open")
-        if self.split_size is None or self.path == STDIO or writer.size < self.split_size:
+        if self.split_size is None or writer.size < self.split_size:
             return writer
         self._writer = None  # also where no new one can be begun
         writer.close()

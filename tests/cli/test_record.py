@@ -212,7 +212,8 @@ def test_what_a_disk_is_too_slow_for_is_told(tmp_path: Path) -> None:
 def test_a_stream_is_not_split(scene: Path, tmp_path: Path) -> None:
     done = mushpipe("record", "--source", scene, "-o", "-", "--split-size", "1MB", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (EXIT_USAGE, "")
-    assert "--split-size: a stream cannot be split" in done.stderr
+    assert "--split-size 1MB: " in done.stderr
+    assert "standard output is one stream, which cannot be split" in done.stderr
 
 
 def test_every_part_of_a_split_recording_is_complete(scene: Path, tmp_path: Path) -> None:
