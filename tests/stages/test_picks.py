@@ -67,6 +67,27 @@ def test_flags_say_what_is_not_measured() -> None:
     assert picks.frame_id == "camera_color_optical_frame"
 
 
+@pytest.mark.parametrize(
+    ("center", "cut"),
+    [
+        ((8, 60), False),  # from the first pixel on
+        ((7.5, 60), True),
+        ((151, 60), False),  # up to the last of 160
+        ((151.5, 60), True),
+        ((80, 8), False),
+        ((80, 7.5), True),
+        ((80, 111), False),  # up to the last of 120
+        ((80, 111.5), True),
+    ],
+)
+def test_what_any_border_of_the_image_cuts_is_flagged(
+    center: tuple[float, float], cut: bool
+) -> None:
+    frame = frame_of(np.zeros((120, 160)))
+    picks = MakePicks().process(frame, circles_at(center), Locations.unknown(1))
+    assert bool(picks.flags[0] & PickFlag.AT_BORDER) is cut
+
+
 def test_the_apex_stands_in_for_the_surface_only_where_the_pose_is_valid() -> None:
     circles = circles_at((50, 50), (80, 50))
     apex = CAMERA.deproject(np.array([[52.0, 50.0]]), np.array([0.48]))[0].tolist()
