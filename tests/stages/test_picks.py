@@ -347,6 +347,18 @@ def test_the_end_of_a_run_says_how_many_were_left_out(caplog: pytest.LogCaptureF
     assert "1 of 2 mushrooms are left out of the picks" in caplog.text
 
 
+@pytest.mark.parametrize(("memory_s", "again"), [(2.4, 2), (2.6, 0)])
+def test_an_id_is_remembered_for_so_many_seconds(memory_s: float, again: int) -> None:
+    """Something is before the mushroom from the second picture on, up to 2.5 s."""
+    stage, ids = MakePicks(memory_s=memory_s), []
+    for at_ms, u in ((0, 50), (1000, 110), (2500, 50)):
+        frame = frame_of(np.zeros((120, 160)))
+        frame = replace(frame, header=replace(frame.header, stamp_ns=at_ms * 1_000_000))
+        found = locations(DepthSource.MEASURED, at=(u,))
+        ids.extend(stage.process(frame, circles_at((u, 50)), found).id.tolist())
+    assert ids == [0, 1, again]
+
+
 def test_diameters_in_metres_are_refused() -> None:
     with pytest.raises(ValueError, match="in mm, not in m"):
         MakePicks(diameter_mm=(0.02, 0.06))
