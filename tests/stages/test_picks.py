@@ -502,6 +502,23 @@ def test_the_sigma_of_a_leaning_apex_turns_with_the_cap() -> None:
     np.testing.assert_allclose(picks.sigma_position[0], [across, across, along], atol=1e-9)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_a_hidden_share_is_that_of_the_pixels_counted_one_by_one(seed: int) -> None:
+    """Also of circles that reach beyond the image, of which only what is in view counts."""
+    rng, n = np.random.default_rng(seed), 12
+    center, radius = rng.uniform(-8, [88, 68], (n, 2)), rng.uniform(3, 20, n)
+    distance = np.where(rng.random(n) < 0.2, NAN, rng.uniform(0.3, 0.6, n))
+    v, u = np.mgrid[:60, :80]
+    inside = [np.hypot(u - x, v - y) <= r for (x, y), r in zip(center, radius, strict=True)]
+    expected = []
+    for own, away in zip(inside, distance, strict=True):
+        nearer = distance < (np.inf if np.isnan(away) else away)  # what has no depth hides nothing
+        hidden = np.any([own & inside[k] for k in np.flatnonzero(nearer)], axis=0)
+        expected.append(hidden.sum() / max(own.sum(), 1))
+    found = hidden_share(Circles(center, radius, np.ones(n)), distance, (80, 60))
+    assert found == pytest.approx(expected, abs=1e-12)
+
+
 def test_a_mushroom_without_depth_hides_nothing() -> None:
     circles = circles_at((50, 50), (56, 50), (62, 50))
     depth = np.array([NAN, NAN, 0.5])
