@@ -347,6 +347,17 @@ def test_the_end_of_a_run_says_how_many_were_left_out(caplog: pytest.LogCaptureF
     assert "1 of 2 mushrooms are left out of the picks" in caplog.text
 
 
+def test_the_end_of_a_run_that_gave_all_mushrooms_says_nothing(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    stage = MakePicks()
+    with caplog.at_level(logging.WARNING, "mushpipe"):
+        stage.open()
+        stage.process(frame_of(np.zeros((120, 160))), *bed(BED[0], BED[2]))
+        stage.close()
+    assert caplog.messages == []
+
+
 @pytest.mark.parametrize(("memory_s", "again"), [(2.4, 2), (2.6, 0)])
 def test_an_id_is_remembered_for_so_many_seconds(memory_s: float, again: int) -> None:
     """Something is before the mushroom from the second picture on, up to 2.5 s."""
