@@ -184,6 +184,20 @@ def test_a_constant_error_of_depth_is_taken_off() -> None:
     assert np.linalg.norm(poses.apex[0] - true.apex) < 8e-4
 
 
+def test_that_error_is_taken_off_over_a_hole_as_well() -> None:
+    true = cap(10, 30, (0.01, -0.01, 0.4), 0.022, 0.55)
+    depth, gray = draw([true], 0.44)
+    circles = circles_of([true])
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    hole = np.hypot(u - circles.center[0, 0], v - circles.center[0, 1]) < 5
+    top = depth[tuple(np.rint(circles.center[0, ::-1]).astype(int))]
+    depth = np.where(hole, np.nan, depth + 0.008)
+    stage = CapFit(up="camera", depth_bias_mm=8)
+    found = stage.process(frame_from(depth, gray), circles)[0]
+    assert found.source[0] == DepthSource.NEIGHBOURS
+    assert found.position[0, 2] == pytest.approx(top, abs=5e-4)
+
+
 def test_a_lens_with_distortion_is_followed() -> None:
     bent = Camera(320, 240, 400, 400, 159.5, 119.5, "brown_conrady", (0.15, -0.2, 0.002, 0.001, 0))
     true = cap(20, 130, (-0.09, 0.06, 0.4), 0.022, 0.6)

@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from mushpipe import Circles, DepthSource, RgbdFrame
+from mushpipe import Circles, DepthSource, Locations, Poses, RgbdFrame
 from mushpipe.stages.cap.batch import Fits
 from mushpipe.stages.cap.verify import FILE, FLAT_CHANCE, NAMES, chances, features
 from mushpipe.stages.cap_fit import CapFit
@@ -143,6 +143,25 @@ def test_without_a_least_score_nothing_is_left_out_and_scores_stay() -> None:
     locations, poses, found = CapFit(up="camera").process(frame_from(depth, gray), circles)
     assert found.score == pytest.approx(circles.score, abs=0)
     assert len(found) == len(locations) == len(poses) == 6
+
+
+def test_of_two_circles_of_one_cap_that_with_a_position_stays_however_sure_the_other_is() -> None:
+    """The rows of what is kept keep their order."""
+    circles = Circles([[50, 50], [51, 50], [90, 50], [130, 50]], [20.0] * 4, [0.9, 0.6, 0.7, 0.4])
+    position = np.array([[np.nan] * 3, [0, 0, 0.4], [0, 0, 0.5], [0, 0, 0.6]])
+    known = np.array([False, True, True, True])
+    found = Locations.unknown(
+        4,
+        position=position,
+        distance=position[:, 2],
+        source=np.where(known, DepthSource.MEASURED, DepthSource.MISSING),
+    )
+    located, poses, kept = CapFit(min_score=0.5)._kept(found, Poses.unknown(4), circles)
+    assert kept.center[:, 0].tolist() == [51, 90]
+    assert located.position[:, 2].tolist() == [0.4, 0.5]
+    assert len(poses) == 2
+    both = CapFit(min_score=0.5)._kept(Locations.unknown(4), Poses.unknown(4), circles)[2]
+    assert both.center[:, 0].tolist() == [50, 90]  # the surer one
 
 
 def test_the_score_of_the_detector_decides_where_there_is_no_depth() -> None:
