@@ -149,7 +149,7 @@ def fuse(
                 if mean[v, u] > 0:
                     age[v, u] += 1
                     if age[v, u] > longest:
-                        mean[v, u], held[v, u] = 0, 0
+                        mean[v, u] = 0
                 continue
             age[v, u] = 0
             step = z - mean[v, u]

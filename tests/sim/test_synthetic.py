@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from mushpipe import RgbdFrame
 from mushpipe.core.errors import DependencyError
 from mushpipe.core.truth import INSTANCES_TOPIC, TRUTH_TOPIC
+from mushpipe.sim.ground import RIM_HEIGHT
 from mushpipe.sources.synthetic import SyntheticSource
 
 SMALL = {"width": 160, "height": 120, "count": 15, "pins": 5}
@@ -136,6 +137,21 @@ def test_a_bed_with_everything_on_it():
     upright = truth.axis[truth.ignore == 0]
     tilt = np.degrees(np.arccos(-upright[:, 2]))
     assert ((tilt > 19.9) & (tilt < 45.1)).all()
+
+
+def test_the_rim_of_a_tray_stands_at_the_left_and_nowhere_else():
+    """A plank 16 mm wide, whose inner face is at 0.09 of the view of the bed."""
+    perfect = dict.fromkeys(("shadow", "grazing", "highlights", "edges"), False)
+    perfect |= {"noise": 0, "offset_mm": 0, "cap_holes": 0, "random_holes": 0}
+    empty = SMALL | {"count": 0, "pins": 0, "distance": 0.5, "sensor": perfect}
+    bare, rimmed = (next(SyntheticSource(**empty, tray=tray).frames()) for tray in (False, True))
+    away = 0.5 - RIM_HEIGHT
+    right = round(160 * (0.5 - 0.41 * 0.5 / away))  # px; what is higher is seen further out
+    left = right - round(0.016 * rimmed.camera.fx / away)
+    top = rimmed.depth_m[:, left + 1 : right - 1]
+    assert top.shape[1] > 1
+    np.testing.assert_allclose(top, away, atol=2e-4)
+    assert (rimmed.depth_m != bare.depth_m)[:, 17:].mean() < 0.02  # small things on the bed
 
 
 def test_a_tilted_camera_sees_a_tilted_bed():

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from mushpipe import Camera, Circles, DepthSource, Locations, Poses
 from mushpipe.stages.cap.model import ROOM, SIZE, fill_rows, move, span
-from mushpipe.stages.cap_fit import CapFit
+from mushpipe.stages.cap_fit import CapFit, _beside_edges
 from mushpipe.stages.upright import pixel_rays, upright
 from tests.stages.caps import (
     CAMERA,
@@ -84,6 +86,32 @@ def test_sigmas_and_fitness_are_positive_and_the_quaternion_turns_z_onto_the_axi
     assert (locations.sigma_position > 0).all()
     assert 0 < locations.sigma_diameter[0] < 0.002
     assert locations.distance[0] == pytest.approx(np.linalg.norm(locations.position[0]))
+
+
+def test_a_diameter_is_twice_a_radius_and_so_is_its_sigma() -> None:
+    caps = [cap(20, 40, (-0.05, 0, 0.4), 0.02, 0.6), cap(5, 90, (0.05, 0, 0.41), 0.025, 0.5)]
+    depth, gray = draw(caps, 0.44)
+    frame, circles, stage = frame_from(depth, gray), circles_of(caps), CapFit(up="camera")
+    fits = stage.fit(frame.gray, frame.depth_m, CAMERA, circles)
+    found, poses, _ = stage.process(frame, circles)
+    assert found.diameter == pytest.approx(2 * fits.radius)
+    assert found.sigma_diameter == pytest.approx(2 * fits.sigma_radius)
+    assert (fits.sigma_radius > np.sqrt(fits.covariance[:, 5, 5])).all()
+    np.testing.assert_array_equal(poses.apex, fits.apex)
+    np.testing.assert_array_equal(found.position, fits.surface)
+    np.testing.assert_array_equal(found.sigma_position, fits.sigma_surface)
+
+
+def test_edges_that_are_off_widen_the_sigmas_by_their_share_of_the_radius() -> None:
+    """2 px of 40 are 0.05: of a cap 40 mm wide half of 2 mm, and of a tilt 1.5 times as much."""
+    locations = Locations.unknown(2, diameter=[0.04, np.nan], sigma_diameter=[0.0005, np.nan])
+    poses = replace(Poses.unknown(2), sigma_rad=np.array([0.1, np.nan]))
+    radius = np.array([40.0, 40.0])
+    found, leaning = _beside_edges(locations, poses, 2.0, radius)
+    assert found.sigma_diameter[0] == pytest.approx(np.hypot(0.0005, 0.001))
+    assert leaning.sigma_rad[0] == pytest.approx(np.hypot(0.1, 0.075))
+    assert np.isnan([found.sigma_diameter[1], leaning.sigma_rad[1]]).all()
+    assert _beside_edges(locations, poses, 0.0, radius) == (locations, poses)
 
 
 def test_the_whole_scene_turned_in_the_image_turns_the_answer() -> None:
@@ -182,6 +210,20 @@ def test_a_constant_error_of_depth_is_taken_off() -> None:
     stage = CapFit.model_validate({**EXACT, "up": "camera", "depth_bias_mm": 2.85})
     _, poses, _ = stage.process(frame_from(depth + 0.00285, gray), circles_of([true]))
     assert np.linalg.norm(poses.apex[0] - true.apex) < 8e-4
+
+
+def test_that_error_is_taken_off_over_a_hole_as_well() -> None:
+    true = cap(10, 30, (0.01, -0.01, 0.4), 0.022, 0.55)
+    depth, gray = draw([true], 0.44)
+    circles = circles_of([true])
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    hole = np.hypot(u - circles.center[0, 0], v - circles.center[0, 1]) < 5
+    top = depth[tuple(np.rint(circles.center[0, ::-1]).astype(int))]
+    depth = np.where(hole, np.nan, depth + 0.008)
+    stage = CapFit(up="camera", depth_bias_mm=8)
+    found = stage.process(frame_from(depth, gray), circles)[0]
+    assert found.source[0] == DepthSource.NEIGHBOURS
+    assert found.position[0, 2] == pytest.approx(top, abs=5e-4)
 
 
 def test_a_lens_with_distortion_is_followed() -> None:

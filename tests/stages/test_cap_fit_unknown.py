@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mushpipe import Camera, Circles, DepthSource, Header, InputError, RgbdFrame
+from mushpipe.stages.cap.batch import Fits
 from mushpipe.stages.cap.regrow import beyond
-from mushpipe.stages.cap_fit import CapFit
+from mushpipe.stages.cap_fit import CapFit, _sigma_tilt
 from mushpipe.stages.picks import MakePicks
 from tests.stages.caps import (
     CAMERA,
@@ -98,6 +99,28 @@ def test_where_tilt_cannot_be_seen_the_sigma_says_so() -> None:
     _, ball = fit([cap(0, 0, (0, 0, 0.4), 0.02, 1.0)], tilt_deg=25)
     _, flat = fit([cap(0, 0, (0, 0, 0.4), 0.02, 0.45)], tilt_deg=25)
     assert ball.sigma_rad[0] > 2 * flat.sigma_rad[0]
+
+
+@pytest.mark.parametrize("aspect", [0.2, 0.5, 0.7])
+@pytest.mark.parametrize("correlation", [-0.7, 0.0, 0.8])
+def test_the_sigma_of_a_tilt_is_the_mean_over_what_the_aspect_may_be(
+    aspect: float, correlation: float
+) -> None:
+    """Its variance goes by 1 / (1 - a^2)^2; the mean over a, which R and h tell, by quadrature."""
+    radius, sigma = 0.02, np.array([0.0002, 0.00015])
+    node, weight = np.polynomial.hermite_e.hermegauss(12)
+    first, second = np.meshgrid(node, node)
+    wider = sigma[0] * first
+    higher = sigma[1] * (correlation * first + np.sqrt(1 - correlation**2) * second)
+    a = aspect + (higher - aspect * wider) / radius  # small errors
+    mean = (np.outer(weight, weight) / (2 * np.pi) * (1 - a**2) ** -2).sum()
+    covariance = np.zeros((1, 8, 8))
+    covariance[0, 5:7, 5:7] = np.outer(sigma, sigma) * [[1, correlation], [correlation, 1]]
+    fits = Fits(**{each.name: np.zeros(1) for each in fields(Fits)})
+    fits.radius[:], fits.height[:], fits.sigma_tilt[:] = radius, aspect * radius, 0.1
+    found = _sigma_tilt(replace(fits, covariance=covariance))
+    growth = mean * (1 - aspect**2) ** 2 - 1
+    assert (found / 0.1) ** 2 - 1 == pytest.approx(growth, rel=0.03)
 
 
 def test_a_cap_that_does_not_fit_the_model_says_so_in_its_sigmas() -> None:

@@ -71,6 +71,27 @@ def test_where_no_ground_is_seen_it_is_not_known() -> None:
     assert np.isnan(stands(nothing, circles, apexes, -DOWN, 0.0)).all()
 
 
+def test_a_third_of_the_ground_that_is_no_ground_moves_nothing() -> None:
+    """A hand or a tray's rim beside the cap, or a hole."""
+    circle, apex = np.array([[160.0, 120, 20]]), np.array([[0.0, 0, 0.36]])
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    third = np.abs(np.arctan2(v - 120, u - 160)) < np.radians(58)
+    for other in (0.25, 0.9):
+        image = image_of(np.where(third, other, ground(-DOWN, 0.4)), circle)
+        assert stands(image, circle, apex, -DOWN, 0.0) == pytest.approx([0.04], abs=1e-6)
+
+
+@pytest.mark.parametrize(("degrees", "known"), [(20, False), (30, False), (100, True)])
+def test_a_glimpse_of_the_ground_tells_nothing(degrees: float, known: bool) -> None:
+    """Of 72 places all around 12 must be seen: of every direction three."""
+    circle, apex = np.array([[160.0, 120, 20]]), np.array([[0.0, 0, 0.36]])
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    seen = np.abs(np.degrees(np.arctan2(v - 120, u - 160))) < degrees / 2
+    image = image_of(np.where(seen, ground(-DOWN, 0.4), 0), circle)
+    found = stands(image, circle, apex, -DOWN, 0.0)
+    assert found == pytest.approx([0.04 if known else np.nan], abs=1e-6, nan_ok=True)
+
+
 def test_a_fit_tells_how_high_its_cap_stands() -> None:
     caps = [cap(10, 0, (-0.06, 0, 0.4), 0.02, 0.5), cap(0, 0, (0.06, 0, 0.43), 0.02, 0.6)]
     depth, gray = draw(caps, 0.44)

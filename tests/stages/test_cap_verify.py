@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
+
 import numpy as np
 import pytest
 
-from mushpipe import Circles, DepthSource, RgbdFrame
+from mushpipe import Circles, DepthSource, Locations, Poses, RgbdFrame
+from mushpipe.stages.cap.batch import Fits
 from mushpipe.stages.cap.verify import FILE, FLAT_CHANCE, NAMES, chances, features
 from mushpipe.stages.cap_fit import CapFit
 from mushpipe.stages.verifier import LIMIT, logistic, logit, package_file, read_models
@@ -142,6 +145,25 @@ def test_without_a_least_score_nothing_is_left_out_and_scores_stay() -> None:
     assert len(found) == len(locations) == len(poses) == 6
 
 
+def test_of_two_circles_of_one_cap_that_with_a_position_stays_however_sure_the_other_is() -> None:
+    """The rows of what is kept keep their order."""
+    circles = Circles([[50, 50], [51, 50], [90, 50], [130, 50]], [20.0] * 4, [0.9, 0.6, 0.7, 0.4])
+    position = np.array([[np.nan] * 3, [0, 0, 0.4], [0, 0, 0.5], [0, 0, 0.6]])
+    known = np.array([False, True, True, True])
+    found = Locations.unknown(
+        4,
+        position=position,
+        distance=position[:, 2],
+        source=np.where(known, DepthSource.MEASURED, DepthSource.MISSING),
+    )
+    located, poses, kept = CapFit(min_score=0.5)._kept(found, Poses.unknown(4), circles)
+    assert kept.center[:, 0].tolist() == [51, 90]
+    assert located.position[:, 2].tolist() == [0.4, 0.5]
+    assert len(poses) == 2
+    both = CapFit(min_score=0.5)._kept(Locations.unknown(4), Poses.unknown(4), circles)[2]
+    assert both.center[:, 0].tolist() == [50, 90]  # the surer one
+
+
 def test_the_score_of_the_detector_decides_where_there_is_no_depth() -> None:
     depth, gray, circles = scene()
     circles = Circles(circles.center, circles.radius, [0.6, 0.3, 0.6, 0.6, 0.6, 0.6])
@@ -199,6 +221,38 @@ def test_features_tell_how_far_a_cap_leans_and_how_wrong_the_size_of_its_circle_
     assert columns["resized"] == pytest.approx(np.abs(moved))
     assert (moved[[0, 2]] * [-1, 1] > 0.01).all()
     assert (columns["resized"][[1, 3]] < 0.005).all()
+
+
+def test_features_are_what_can_be_worked_out_by_hand() -> None:
+    circles = Circles([[50, 60], [100, 60], [150, 60], [200, 60]], [20.0] * 4, [0.5, 0.9, 0.2, 0.5])
+    fits = Fits(**{each.name: np.zeros(4) for each in fields(Fits)})
+    fits = replace(
+        fits,
+        valid=np.array([True, True, True, False]),
+        circle=np.array([[53.0, 64, 20], [100, 60, 30], [150, 60, 10], [200, 60, 20]]),
+        radius=np.array([0.02, 0.02, 0.04, np.nan]),
+        height=np.array([0.01, 0.02, 0.004, np.nan]),
+        misfit=np.array([0.2, 0.4, 0.8, np.nan]),
+        sigma_tilt=np.array([0.1, 0.001, 9.0, np.nan]),
+        lean=np.array([0.3, 0.0, 1.2, np.nan]),
+        stand=np.array([0.03, np.nan, 0.4, np.nan]),
+    )
+    found = features(circles, np.array([0.7, np.nan, 2.0, 1.0]), fits, np.array([0, 0.5, 1, 0.8]))
+    least = np.log(0.005 / 0.995)  # logits have an end
+    expected = {
+        "score": [0, np.log(9), -np.log(4), 0],
+        "misfit": [-np.log(2), 0, np.log(2), np.nan],
+        "tilt": [np.log(0.1), np.log(0.02), np.log(3), np.nan],
+        "aspect": [0.5, 0.6, 0.2, np.nan],  # 0.5, 1 and 0.1, from 0.2 to 0.6
+        "moved": [5 / 20, 0, 0, np.nan],
+        "resized": [0, np.log(1.5), np.log(2), np.nan],
+        "lean": [0.3, 0, 1.2, np.nan],
+        "stand": [1.5, 2.5, 2.5, np.nan],
+        "unlike": [0.7, np.nan, 2, 1],
+        "learned": [least, 0, -least, np.log(4)],
+    }
+    for name, column in zip(NAMES, found.T, strict=True):
+        assert column == pytest.approx(expected[name], nan_ok=True), name
 
 
 def test_a_surer_detector_never_makes_a_cap_less_likely() -> None:

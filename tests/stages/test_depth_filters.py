@@ -44,13 +44,14 @@ def test_noise_as_it_is_at_a_distance_starts_no_pixel_anew(z: float) -> None:
     assert out.depth.std() == pytest.approx(noise / np.sqrt(5), rel=0.06)
 
 
-def test_two_surfaces_are_never_mixed_and_edges_stay() -> None:
+@pytest.mark.parametrize(("native", "unit"), [(np.uint16, 0.001), (np.float32, 1.0)])
+def test_two_surfaces_are_never_mixed_and_edges_stay(native: type, unit: float) -> None:
     stage = FuseDepth(frames=5)
-    left, right = np.full(SHAPE, 500, np.uint16), np.full(SHAPE, 500, np.uint16)
-    left[:, 20:], right[:, 22:] = 530, 530
+    left, right = np.full(SHAPE, 0.5 / unit, native), np.full(SHAPE, 0.5 / unit, native)
+    left[:, 20:], right[:, 22:] = 0.53 / unit, 0.53 / unit
     for k in range(6):
-        out = stage.process(frame(left if k % 2 else right))
-        assert set(np.unique(out.depth)) == {500, 530}
+        out = stage.process(frame(left if k % 2 else right, unit))
+        assert set(np.unique(out.depth)) == set(np.unique(left))
     assert (out.depth == left).all()
 
 
@@ -93,12 +94,48 @@ def test_stamps_that_come_twice_do_not_count_twice() -> None:
     assert out.depth[3, 4] == 0
 
 
-def test_a_scene_that_moved_starts_anew() -> None:
+@pytest.mark.parametrize("unit", [0.000125, 0.001, 1.0])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"gate_mm": 4.0, "depth_noise_mm": 0.0, "depth_noise_per_m": 0.0},
+        {"gate_mm": 0.1, "depth_noise_mm": 1.0, "depth_noise_per_m": 0.0},
+        {"gate_mm": 0.1, "depth_noise_mm": 0.0, "depth_noise_per_m": 2.0},  # at 0.5 m
+        {"gate_mm": 0.1, "depth_noise_mm": 0.6, "depth_noise_per_m": 0.8},
+    ],
+)
+def test_the_gate_is_in_mm_and_four_sigmas_of_the_noise_at_that_depth(
+    settings: dict[str, float], unit: float
+) -> None:
+    """All of these let a step of 4 mm pass, at half a metre."""
+    for step, expected in ((0.0039, 0.50195), (0.0041, 0.5041)):
+        stage = FuseDepth(**settings, moved=1.0)
+        near, far = (np.full(SHAPE, z / unit, np.float32) for z in (0.5, 0.5 + step))
+        stage.process(frame(near, unit))
+        np.testing.assert_allclose(stage.process(frame(far, unit)).depth_m, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("unit", [0.001, 1.0])
+def test_a_scene_that_moved_starts_anew(unit: float) -> None:
+    """Also where it is about as far as before, as the columns in the middle are."""
     stage = FuseDepth()
-    ramp = np.linspace(400, 600, 50).astype(np.float32) * np.ones(SHAPE, np.float32)
-    stage.process(frame(ramp))
-    out = stage.process(frame(ramp[:, ::-1].copy()))
+    ramp = (np.linspace(0.45, 0.55, 50) / unit * np.ones(SHAPE)).astype(np.float32)
+    stage.process(frame(ramp, unit))
+    out = stage.process(frame(ramp[:, ::-1].copy(), unit))
     assert (out.depth == ramp[:, ::-1]).all()
+
+
+def test_depth_of_another_unit_or_size_starts_anew() -> None:
+    stage = FuseDepth()
+    stage.process(frame(np.full(SHAPE, 500, np.uint16), 0.001))
+    out = stage.process(frame(np.full(SHAPE, 501, np.uint16), 0.00125))
+    assert (out.depth == 501).all()
+    assert out.depth_scale == 0.00125
+    size = (SHAPE[0] - 1, SHAPE[1])
+    smaller = RgbdFrame(
+        out.header, np.zeros((*size, 3), np.uint8), np.full(size, 502, np.uint16), 0.00125
+    )
+    assert (stage.process(smaller).depth == np.full(size, 502)).all()
 
 
 def test_frames_of_a_moving_camera_pass_as_they_are() -> None:

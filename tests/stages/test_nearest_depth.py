@@ -93,3 +93,44 @@ def test_a_circle_at_the_border_uses_what_is_inside() -> None:
 def test_a_circle_beyond_the_image_is_missing() -> None:
     found = locate(np.full((120, 160), 0.4), circle(400, 300, 10))
     assert found.source[0] == DepthSource.MISSING
+
+
+@pytest.mark.parametrize("neighbours", [1, 4, 30])
+@pytest.mark.parametrize("seed", range(4))
+def test_any_depth_is_located_as_by_looking_at_all_pixels(seed: int, neighbours: int) -> None:
+    """Slanted and full of holes, with circles that reach beyond the image."""
+    rng = np.random.default_rng(seed)
+    u, v = pixel_grid()
+    depth = 0.4 + 0.0007 * u - 0.0004 * v + rng.normal(0, 0.01, u.shape)
+    depth[rng.random(u.shape) < (0.3, 0.6, 0.9, 0.99)[seed]] = np.nan
+    n = 20
+    circles = Circles(rng.uniform(0, [159, 119], (n, 2)), rng.uniform(2, 20, n), np.ones(n))
+    found = NearestDepth(neighbours=neighbours).process(
+        frame_of(np.zeros((120, 160)), depth), circles
+    )
+    depth = depth.astype(np.float32).astype(float)
+    points = CAMERA.deproject(np.stack([u, v], axis=-1), np.nan_to_num(depth))
+    for row, ((x, y), r) in enumerate(zip(circles.center, circles.radius, strict=True)):
+        inside = np.isfinite(depth) & (np.hypot(u - x, v - y) <= r)
+        order = np.argsort(np.hypot(u - x, v - y)[inside])
+        at_centre = depth[round(y), round(x)]
+        if np.isfinite(at_centre):
+            source, position = DepthSource.MEASURED, points[round(y), round(x)]
+        elif inside.any():
+            source = DepthSource.NEIGHBOURS
+            position = points[inside][order[:neighbours]].mean(axis=0)
+        else:
+            source, position = DepthSource.MISSING, np.full(3, np.nan)
+        assert found.source[row] == source
+        assert found.position[row] == pytest.approx(position, abs=1e-9, nan_ok=True)
+        ends = []
+        for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+            side = inside & ((u - x) * dx + (v - y) * dy > 0)
+            end = np.array([x + r * dx, y + r * dy])
+            away = np.where(side, np.hypot(u - end[0], v - end[1]), np.inf)
+            z = depth.ravel()[away.argmin()] if side.any() else np.nan
+            ends.append(CAMERA.deproject(end, np.array(z)))
+        spans = np.linalg.norm([ends[0] - ends[1], ends[2] - ends[3]], axis=1)
+        known = spans[np.isfinite(spans)]
+        expected = known.mean() if len(known) else np.nan
+        assert found.diameter[row] == pytest.approx(expected, abs=1e-9, nan_ok=True)

@@ -67,6 +67,27 @@ def test_flags_say_what_is_not_measured() -> None:
     assert picks.frame_id == "camera_color_optical_frame"
 
 
+@pytest.mark.parametrize(
+    ("center", "cut"),
+    [
+        ((8, 60), False),  # from the first pixel on
+        ((7.5, 60), True),
+        ((151, 60), False),  # up to the last of 160
+        ((151.5, 60), True),
+        ((80, 8), False),
+        ((80, 7.5), True),
+        ((80, 111), False),  # up to the last of 120
+        ((80, 111.5), True),
+    ],
+)
+def test_what_any_border_of_the_image_cuts_is_flagged(
+    center: tuple[float, float], cut: bool
+) -> None:
+    frame = frame_of(np.zeros((120, 160)))
+    picks = MakePicks().process(frame, circles_at(center), Locations.unknown(1))
+    assert bool(picks.flags[0] & PickFlag.AT_BORDER) is cut
+
+
 def test_the_apex_stands_in_for_the_surface_only_where_the_pose_is_valid() -> None:
     circles = circles_at((50, 50), (80, 50))
     apex = CAMERA.deproject(np.array([[52.0, 50.0]]), np.array([0.48]))[0].tolist()
@@ -326,6 +347,29 @@ def test_the_end_of_a_run_says_how_many_were_left_out(caplog: pytest.LogCaptureF
     assert "1 of 2 mushrooms are left out of the picks" in caplog.text
 
 
+def test_the_end_of_a_run_that_gave_all_mushrooms_says_nothing(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    stage = MakePicks()
+    with caplog.at_level(logging.WARNING, "mushpipe"):
+        stage.open()
+        stage.process(frame_of(np.zeros((120, 160))), *bed(BED[0], BED[2]))
+        stage.close()
+    assert caplog.messages == []
+
+
+@pytest.mark.parametrize(("memory_s", "again"), [(2.4, 2), (2.6, 0)])
+def test_an_id_is_remembered_for_so_many_seconds(memory_s: float, again: int) -> None:
+    """Something is before the mushroom from the second picture on, up to 2.5 s."""
+    stage, ids = MakePicks(memory_s=memory_s), []
+    for at_ms, u in ((0, 50), (1000, 110), (2500, 50)):
+        frame = frame_of(np.zeros((120, 160)))
+        frame = replace(frame, header=replace(frame.header, stamp_ns=at_ms * 1_000_000))
+        found = locations(DepthSource.MEASURED, at=(u,))
+        ids.extend(stage.process(frame, circles_at((u, 50)), found).id.tolist())
+    assert ids == [0, 1, again]
+
+
 def test_diameters_in_metres_are_refused() -> None:
     with pytest.raises(ValueError, match="in mm, not in m"):
         MakePicks(diameter_mm=(0.02, 0.06))
@@ -467,6 +511,23 @@ def test_the_sigma_of_a_leaning_apex_turns_with_the_cap() -> None:
     across = 0.4 * 0.05 * np.radians(20) / np.sqrt(2)
     along = 0.05 * 0.012
     np.testing.assert_allclose(picks.sigma_position[0], [across, across, along], atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_hidden_share_is_that_of_the_pixels_counted_one_by_one(seed: int) -> None:
+    """Also of circles that reach beyond the image, of which only what is in view counts."""
+    rng, n = np.random.default_rng(seed), 12
+    center, radius = rng.uniform(-8, [88, 68], (n, 2)), rng.uniform(3, 20, n)
+    distance = np.where(rng.random(n) < 0.2, NAN, rng.uniform(0.3, 0.6, n))
+    v, u = np.mgrid[:60, :80]
+    inside = [np.hypot(u - x, v - y) <= r for (x, y), r in zip(center, radius, strict=True)]
+    expected = []
+    for own, away in zip(inside, distance, strict=True):
+        nearer = distance < (np.inf if np.isnan(away) else away)  # what has no depth hides nothing
+        hidden = np.any([own & inside[k] for k in np.flatnonzero(nearer)], axis=0)
+        expected.append(hidden.sum() / max(own.sum(), 1))
+    found = hidden_share(Circles(center, radius, np.ones(n)), distance, (80, 60))
+    assert found == pytest.approx(expected, abs=1e-12)
 
 
 def test_a_mushroom_without_depth_hides_nothing() -> None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mushpipe import Circles, DepthSource, Locations, Poses, quaternion_from_axis
+from mushpipe import Circles, DepthSource, Locations, PickFlag, Picks, Poses, quaternion_from_axis
 from mushpipe.stages.picks import MakePicks
 from tests.stages.scenes import CAMERA, frame_of
 
@@ -31,7 +31,7 @@ def poses(apex: np.ndarray) -> Poses:
     [
         (POSITION * 0, 1, r"row 0: its location is at .*0, 0\), which is not in front"),
         (-POSITION, 1, r"its location is at .*, which is not in front of the camera"),
-        (POSITION, 1000, "row 0: its diameter is .* m, but its circle is .* m wide"),
+        (POSITION, 1000, r"row 0: its diameter is 40 m, but its circle is 0\.04 m wide"),
         (POSITION * 1000, 1, "row 0: its distance is .* in metres"),
         (POSITION * 100, 1, "row 0: its distance is .* in metres"),
     ],
@@ -73,6 +73,46 @@ def test_one_bad_depth_ends_no_run() -> None:
     size = LOCATIONS.diameter * [30, 1]
     found = MakePicks().process(FRAME, CIRCLES, replace(LOCATIONS, diameter=size), poses(POSITION))
     assert len(found) == 2
+
+
+@pytest.mark.parametrize(
+    ("distance", "size", "rise"),
+    [
+        (0.5, 4.5, 0.0),  # the diameter is no more than four times as wide as the circle,
+        (0.5, 1 / 4.5, 0.0),  # and no less than a fourth
+        (0.5, 1, 4.5),  # the apex no more than four such widths away
+        (6.0, 2.5, 0.0),  # and no cap is over a metre wide: circles of 16 px are 0.48 m at 6 m
+    ],
+)
+def test_a_row_that_contradicts_itself_is_unknown_and_the_others_stay(
+    distance: float, size: float, rise: float
+) -> None:
+    position = CAMERA.deproject(CIRCLES.center, np.full(2, distance))
+    away, width = np.linalg.norm(position, axis=1), 16 / CAMERA.fx * distance
+    found = replace(LOCATIONS, position=position, distance=away, diameter=width * np.ones(2))
+    assert not missing(MakePicks().process(FRAME, CIRCLES, found, poses(position))).any()
+    found = replace(found, diameter=found.diameter * [1, size])
+    apex = position * (1 - np.array([[0], [rise * width]]) / away[:, None])
+    picks = MakePicks().process(FRAME, CIRCLES, found, poses(apex))
+    assert missing(picks).tolist() == [False, True]
+    assert np.isnan(picks.position[1]).all()
+    assert np.isnan(picks.axis).all(axis=1).tolist() == [False, True]
+
+
+def missing(picks: Picks) -> np.ndarray:
+    """Return which mushrooms have no position, the first circle's first."""
+    return ((picks.flags & PickFlag.DEPTH_MISSING) > 0)[np.argsort(picks.id)]
+
+
+def test_lengths_are_of_another_unit_where_most_are_not_where_two_of_five_are() -> None:
+    circles, found = of_size(0.03, 5)
+    for wrong in (2, 3):
+        some = replace(found, diameter=found.diameter * np.where(np.arange(5) < wrong, 30, 1))
+        if wrong == 2:
+            assert missing(MakePicks().process(FRAME, circles, some)).tolist() == [1, 1, 0, 0, 0]
+        else:
+            with pytest.raises(ValueError, match="and so it is in most rows"):
+                MakePicks().process(FRAME, circles, some)
 
 
 def test_without_a_calibration_a_location_is_in_front_of_the_camera_all_the_same() -> None:

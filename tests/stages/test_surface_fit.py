@@ -151,6 +151,26 @@ def test_noise_stays_below_the_stated_sigma_and_moves_nothing() -> None:
     assert np.abs(bias).max() < 1e-4
 
 
+def test_a_circle_that_is_off_moves_what_the_sigmas_say() -> None:
+    """By a pixel, and by how much the answer moves with it."""
+    circles, depth = circles_of(CAPS[:1]), draw(CAPS, BED)[0]
+    frame = frame_from(depth, GRAY)
+    wider, narrower = (
+        SurfaceFit().process(frame, replace(circles, radius=circles.radius + by)) for by in (1, -1)
+    )
+    right, left = (
+        SurfaceFit().process(frame, replace(circles, center=circles.center + np.array([by, 0])))
+        for by in (1, -1)
+    )
+    sure, unsure = (
+        SurfaceFit(circle_sigma_px=sigma).process(frame, circles) for sigma in (0.001, 1.0)
+    )
+    size = np.sqrt(unsure.sigma_diameter**2 - sure.sigma_diameter**2)
+    assert size == pytest.approx((wider.diameter - narrower.diameter) / 2, rel=0.15)
+    place = np.sqrt(unsure.sigma_position**2 - sure.sigma_position**2)
+    assert place[0, 0] == pytest.approx((right.position - left.position)[0, 0] / 2, rel=0.1)
+
+
 def test_a_distorted_camera_changes_nothing() -> None:
     lens = (0.1, -0.2, 0.002, -0.001, 0.05)
     bent = Camera(320, 240, 400.0, 400.0, 159.5, 119.5, "brown_conrady", lens)

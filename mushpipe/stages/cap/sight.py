@@ -27,8 +27,6 @@ def drop_unseen(fits: Fits, circles: Floats, camera: Camera) -> None:
     unseen = np.zeros(len(circles), np.bool_)
     for points, within in ((fits.surface, LOCATION_WITHIN), (fits.apex, POSE_WITHIN)):
         unseen |= _unseen(points, fits.circle, camera, within)
-    if not unseen.any():
-        return
     for field in fields(fits):
         values = getattr(fits, field.name)
         values[unseen] = np.nan if values.dtype.kind == "f" else 0
