@@ -45,13 +45,15 @@ def metrics(content: dict[str, Any], number: int = 0) -> dict[str, float]:
     return {name: value["value"] for name, value in overall.items()}
 
 
-def test_truth_against_itself(perfect: Path) -> None:
+def test_truth_against_itself(perfect: Path, truths: dict[int, Any]) -> None:
     content = judged(perfect)
     values = metrics(content)
     assert values["f"] == 1
     assert values["surface_p95_mm"] == pytest.approx(0, abs=1e-6)
     assert values["apex_p95_mm"] == pytest.approx(0, abs=1e-6)
     assert values["calibration_tilt"] is None
+    tilts = [np.degrees(np.arccos(-truth.axis[:, 2])) for truth in truths.values()]  # from up, -z
+    assert values["upright_mean_deg"] == pytest.approx(np.concatenate(tilts).mean())
     (only,) = content["alternatives"]
     assert only["overall"]["frames"] == 3
     assert only["speed"]["pick"]["p95_ms"] == 2.5
