@@ -256,9 +256,14 @@ def test_a_frame_without_an_answer_is_missed(tmp_path: Path, truths: dict[int, A
     content = judged(results)
     assert metrics(content)["recall"] == pytest.approx(2 / 3)
     assert content["alternatives"][0]["frames"][2]["answered"] is False
+    gap = write_results(tmp_path / "g.mcap", {i: picks_of(truths[i]) for i in (0, 2)}, truths)
+    frames = judged(gap)["alternatives"][0]["frames"]
+    assert [frame["answered"] for frame in frames] == [True, False, True]
     manifest = json.dumps({"graph": {"source": {"max_frames": 2}}})
     partial = write_results(tmp_path / "p.mcap", answers, truths, manifest=manifest)
-    assert metrics(judged(partial))["recall"] == 1
+    content = judged(partial)
+    assert metrics(content)["recall"] == 1
+    assert content["alternatives"][0]["recordings"][0]["notes"] == []
 
 
 @pytest.mark.parametrize("failing", [[0], [2], [0, 2], [1]])
@@ -340,6 +345,8 @@ def test_several_results_are_judged_each_and_together(
     (only,) = judged(*files)["alternatives"]
     assert [r["metrics"]["recall"]["value"] for r in only["recordings"]] == [1, 0.5]
     assert only["overall"]["metrics"]["recall"]["value"] == 0.75
+    counts = [only["overall"][name] for name in ("truths", "found", "missed", "false")]
+    assert counts == [120, 90, 30, 0]
 
 
 def test_results_of_one_recording_are_compared_and_not_pooled(
