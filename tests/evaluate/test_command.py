@@ -112,6 +112,8 @@ def test_truth_is_found_in_the_recording_the_results_name(
     assert isinstance(result.exception, InputError)
     assert "--truth" in str(result.exception)
     assert metrics(judged(results, "--truth", write_recording(recording, truths)))["f"] == 1
+    said = str(run(write_results(tmp_path / "bare.mcap", answers)).exception)
+    assert said.endswith("bare.mcap: the truth is not to be found; give it with --truth")
 
 
 def test_truth_of_another_recording_is_told_of(tmp_path: Path, truths: dict[int, Any]) -> None:
