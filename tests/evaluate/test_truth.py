@@ -15,6 +15,7 @@ from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.recording import MANIFEST
 from mushpipe.core.truth import TRUTH_TOPIC, Ignore
+from mushpipe.core.wire import json_message, json_schema
 from mushpipe.evaluate.judging import Rules, judge_results
 from mushpipe.evaluate.labels import EXAMPLE, convert, parse_labels
 from mushpipe.evaluate.results import Results, of_picks
@@ -340,6 +341,17 @@ def test_numbers_of_frames_do_not_fit_a_run_that_began_later(tmp_path: Path) -> 
     assert len(judge_results(results, numbered, Rules()).verdicts[0].matching.truth) == 20
     results.frames.clear()
     assert judge_results(results, numbered, Rules()).verdicts == []
+
+
+def test_what_is_no_truth_on_its_topic_is_refused(tmp_path: Path) -> None:
+    foreign = json_message(json_schema("mine.Truth", {}), header(0), {})
+    for name, value in (("mushpipe.Picks", picks_of(bed(0))), ("mine.Truth", foreign)):
+        path = tmp_path / f"{name}.mcap"
+        writer = RecordingWriter(path, {})
+        writer.value(TRUTH_TOPIC, value, header(0))
+        writer.close()
+        with pytest.raises(InputError, match=f"{TRUTH_TOPIC} holds '{name}', expected mushpipe.Tr"):
+            read_truth(path)
 
 
 def test_a_recording_without_truth_says_so(tmp_path: Path) -> None:
