@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +67,7 @@ def test_the_window_is_central() -> None:
     window = window_of(depth)
     assert window.shape == (31, 31)
     assert window[15, 15] == 1000
+    assert window_of(np.zeros((31, 40), np.float32)).shape == (31, 31)
     with pytest.raises(InputError, match="smaller"):
         window_of(np.zeros((30, 40), np.float32))
 
@@ -170,6 +172,13 @@ def test_a_correction_is_a_polynomial_of_what_is_measured() -> None:
     assert found.left == pytest.approx([0] * 4, abs=1e-9)
     told = yaml.safe_load(found.fragment())
     assert told == {"offset_mm": 2, "slope_mm_per_m": -1.5, "curve_mm_per_m2": 0.8}
+
+
+def test_a_plane_without_depth_in_the_middle_corrects_nothing() -> None:
+    seen = row_of(0.5, 1.0)
+    unknown = dict.fromkeys(seen.values, Value(np.nan, np.nan, np.nan, 0))
+    with pytest.raises(InputError, match=r"at 0\.5: there is no depth in the middle"):
+        fit_correction([seen, replace(seen, values=unknown)], 0)
 
 
 def test_a_correction_says_what_it_leaves() -> None:
