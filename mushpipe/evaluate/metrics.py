@@ -183,7 +183,7 @@ def measure(events: Events, frames: int, resamples: int = 1000, seed: int = 0) -
 def _value(metric: Metric, x: Floats, drawn: Floats, rows: Ints) -> Value:
     n = int(np.isfinite(x).sum())
     value = statistics.evaluate(metric.statistic, x, np.ones((1, len(x))))[0]
-    if not len(drawn) or not n:
+    if not len(drawn):
         return Value(float(value), np.nan, np.nan, n)
     samples = statistics.evaluate(metric.statistic, x, drawn, rows)
     return Value(float(value), *statistics.interval(samples), n)

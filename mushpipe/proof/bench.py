@@ -106,7 +106,7 @@ def _run(plan: Plan, progress: Progress | None = None) -> RunReport:
 
 
 class _Watch:
-    """CPU time and resident memory at each frame of a run."""
+    """CPU time and resident memory at each frame of a run, of two at least."""
 
     def __init__(self) -> None:
         self.seen_mb: list[float] = []
@@ -121,17 +121,20 @@ class _Watch:
     def cpu_s(self) -> float:
         """Return the CPU time of all frames, from that between the first and the last."""
         count = len(self.seen_s)
-        return (self.seen_s[-1] - self.seen_s[0]) * count / max(count - 1, 1)
+        return (self.seen_s[-1] - self.seen_s[0]) * count / (count - 1)
 
     def growth_mb(self) -> float:
         """Return mean of the last fifth less mean of the second fifth."""
         fifth = max(len(self.seen_mb) // 5, 1)
         early, late = self.seen_mb[fifth : 2 * fifth], self.seen_mb[-fifth:]
-        return sum(late) / len(late) - sum(early) / len(early) if early else 0.0
+        return sum(late) / len(late) - sum(early) / len(early)
 
 
 def _peak_mb() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
+    # getrusage would give the peak of the program that started this one, where that is larger
+    lines = Path("/proc/self/status").read_text().splitlines()
+    (kib,) = (line.split()[1] for line in lines if line.startswith("VmHWM:"))
+    return int(kib) * 1024 / 1e6
 
 
 def _allocated_mb(plan: Plan) -> float:

@@ -239,7 +239,7 @@ def _difference(a: Any, b: Any, tolerance: float, limit: float | None = None) ->
             return f"{a[0].size} channels against {b[0].size}"
         # unknown is the same only as unknown
         apart = (a != b) & ~((a != a) & (b != b))
-        different = int(np.count_nonzero(apart.reshape(len(a), -1).any(axis=1)))
+        different = int(np.count_nonzero(apart.any(axis=tuple(range(1, apart.ndim)))))
         return f"{different} of {len(a)} pixels" if different > tolerance * len(a) else None
     if a.keys() != b.keys():
         number, other = _count(a), _count(b)

@@ -46,15 +46,14 @@ def test_the_index_is_the_same_from_summary_and_from_reading(tmp_path, options):
     assert index.schema_name("/a") == "mine"
     assert index.schema_name("/bare") == ""
     assert set(index.channels) == {"/a", "/b", "/bare"}
+    assert (index.metadata, index.attachments) == ({"note": {"a": "b"}}, ["picture"])
     assert times(reader) == list(range(10, 21))
     assert times(reader, {"/b"}, 12, 16) == [13, 15]
+    assert times(reader, None, 12, 16) == [12, 13, 14, 15]
+    assert times(reader, None, 18) == [18, 19, 20]
+    assert times(reader, None, 0, 12) == [10, 11]
     assert reader.damage == []
     assert reader.index() is index
-
-
-def test_metadata_and_attachments_are_listed(tmp_path):
-    index = RecordingReader(write(tmp_path / "x.mcap")).index()
-    assert (index.metadata, index.attachments) == ({"note": {"a": "b"}}, ["picture"])
 
 
 @pytest.mark.parametrize(

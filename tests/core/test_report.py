@@ -13,12 +13,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mushpipe import GraphPath, RunInfo, Sink, Trace
+from mushpipe import GraphPath, Header, RunInfo, Sink, Trace
 from mushpipe.console import execute
 from mushpipe.core.errors import InputError, PluginError, StageError
 from mushpipe.core.manifest import build_manifest, manifest_path
 from mushpipe.core.report import Durations, RunReport, SinkReport
-from tests.core.lab import Frames, Lab, cli
+from tests.core.lab import Frames, Lab, circles, cli
 
 
 @given(
@@ -87,6 +87,21 @@ def test_the_summary_is_plain_data():
         "elapsed_s": 1.235,
         "capsules": ["c.mcap"],
     }
+
+
+def test_the_span_is_of_all_frames_whatever_their_order():
+    report = RunReport()
+    for stamp_ns, sequence in ((5, 2), (3, 0), (9, 1)):
+        report.widen_span(Header(stamp_ns, sequence, "camera"))
+    assert report.summary()["span"] == {"stamp_ns": (3, 9), "sequence": (0, 2)}
+
+
+def test_what_was_found_are_the_rows_of_the_last_table_of_each_frame():
+    report = RunReport()
+    report.found.add({"detect": (circles(1, 2, 3),), "pick": (circles(4, 5),), "other": (7,)})
+    report.found.add({"detect": (circles(1),), "pick": (circles(),)})
+    report.found.add({"detect": (), "other": (7,)})  # a frame without a table tells nothing
+    assert report.summary()["found"] == {"rows": 2, "frames": 2, "empty": 1}
 
 
 class Recorded(Frames):

@@ -1,7 +1,9 @@
 """The per-mushroom types: shapes, lengths, dtypes, and values that contradict each other."""
 
 import ctypes
+import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -180,6 +182,12 @@ WRONG = [
         {"quaternion": [[1, 0, 0, 0], [NAN] * 4]},  # w x y z
         "Poses: the quaternion, x y z w, must turn +z to the axis, out of the cap (row 0)",
     ),
+    (
+        poses,
+        {"quaternion": [[0.005, 0, 0, 0.9999875], [NAN] * 4]},  # half a degree off
+        "Poses: the quaternion, x y z w, must turn +z to the axis, out of the cap (row 0)",
+    ),
+    (picks, {"source": [3, 0]}, "Picks: the source must be a DepthSource (row 0)"),
     (picks, {"id": [7, 7]}, "Picks: ids must be unique (row 1)"),
     (
         picks,
@@ -206,6 +214,14 @@ def test_what_cannot_be_is_refused(make, changes, message):
     with pytest.raises(ValueError) as caught:  # noqa: PT011 - the whole message is compared
         make(**changes)
     assert str(caught.value) == message
+
+
+def test_flags_have_the_numbers_that_robots_are_told():
+    """Programs of robots and old recordings hold the numbers."""
+    docs = (Path(__file__).parents[2] / "docs/robot.md").read_text()
+    table = re.findall(r"^\| `(\w+)` \| (\d+) \|", docs, re.MULTILINE)
+    stated = {name.upper(): int(number) for name, number in table}
+    assert {**stated, "DEPTH_MISSING": 1} == {flag.name: flag.value for flag in PickFlag}
 
 
 @pytest.mark.parametrize("cls", [Circles, Locations, Poses, Picks, Truth])

@@ -49,6 +49,7 @@ def test_a_file_means_the_same_as_its_content(tmp_path: Path) -> None:
         (INLINE.replace("[0.1, 0, 1]", "[100, 0, 1000]"), "was it given in mm?"),
         (INLINE.replace("frame", "fame"), "unknown setting 'fame'"),
         ("[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]", "or matrix; expected frame, translation"),
+        ("5", "Input should be an object, got 5"),
         ("missing.yaml", "missing.yaml: there is no such file"),
         ("bad.yaml", "expected frame, translation"),
         ("list.yaml", "list.yaml:1:1: expected a mapping such as 'frame: robot_base'; expected fr"),

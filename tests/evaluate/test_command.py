@@ -46,13 +46,15 @@ def metrics(content: dict[str, Any], number: int = 0) -> dict[str, float]:
     return {name: value["value"] for name, value in overall.items()}
 
 
-def test_truth_against_itself(perfect: Path) -> None:
+def test_truth_against_itself(perfect: Path, truths: dict[int, Any]) -> None:
     content = judged(perfect)
     values = metrics(content)
     assert values["f"] == 1
     assert values["surface_p95_mm"] == pytest.approx(0, abs=1e-6)
     assert values["apex_p95_mm"] == pytest.approx(0, abs=1e-6)
     assert values["calibration_tilt"] is None
+    tilts = [np.degrees(np.arccos(-truth.axis[:, 2])) for truth in truths.values()]  # from up, -z
+    assert values["upright_mean_deg"] == pytest.approx(np.concatenate(tilts).mean())
     (only,) = content["alternatives"]
     assert only["overall"]["frames"] == 3
     assert only["speed"]["pick"]["p95_ms"] == 2.5
@@ -111,6 +113,8 @@ def test_truth_is_found_in_the_recording_the_results_name(
     assert isinstance(result.exception, InputError)
     assert "--truth" in str(result.exception)
     assert metrics(judged(results, "--truth", write_recording(recording, truths)))["f"] == 1
+    said = str(run(write_results(tmp_path / "bare.mcap", answers)).exception)
+    assert said.endswith("bare.mcap: the truth is not to be found; give it with --truth")
 
 
 def test_truth_of_another_recording_is_told_of(tmp_path: Path, truths: dict[int, Any]) -> None:
@@ -255,9 +259,14 @@ def test_a_frame_without_an_answer_is_missed(tmp_path: Path, truths: dict[int, A
     content = judged(results)
     assert metrics(content)["recall"] == pytest.approx(2 / 3)
     assert content["alternatives"][0]["frames"][2]["answered"] is False
+    gap = write_results(tmp_path / "g.mcap", {i: picks_of(truths[i]) for i in (0, 2)}, truths)
+    frames = judged(gap)["alternatives"][0]["frames"]
+    assert [frame["answered"] for frame in frames] == [True, False, True]
     manifest = json.dumps({"graph": {"source": {"max_frames": 2}}})
     partial = write_results(tmp_path / "p.mcap", answers, truths, manifest=manifest)
-    assert metrics(judged(partial))["recall"] == 1
+    content = judged(partial)
+    assert metrics(content)["recall"] == 1
+    assert content["alternatives"][0]["recordings"][0]["notes"] == []
 
 
 @pytest.mark.parametrize("failing", [[0], [2], [0, 2], [1]])
@@ -339,6 +348,8 @@ def test_several_results_are_judged_each_and_together(
     (only,) = judged(*files)["alternatives"]
     assert [r["metrics"]["recall"]["value"] for r in only["recordings"]] == [1, 0.5]
     assert only["overall"]["metrics"]["recall"]["value"] == 0.75
+    counts = [only["overall"][name] for name in ("truths", "found", "missed", "false")]
+    assert counts == [120, 90, 30, 0]
 
 
 def test_results_of_one_recording_are_compared_and_not_pooled(

@@ -120,6 +120,15 @@ def _joined(a: Picks, b: Picks) -> Picks:
     return Picks(**{**both, "id": np.arange(len(a) + len(b))}, frame_id=FRAME)
 
 
+def test_a_frame_has_an_f_of_its_own() -> None:
+    truth = bed(0)
+    extra = picks_of(replace(bed(99, 1, 2), center=np.array([[30.0, 30.0], [600.0, 30.0]])))
+    judged = verdict(truth, _joined(picks_of(truth.take(slice(0, 14))), extra))
+    assert judged.f == pytest.approx(28 / (28 + 6 + 2))  # 14 found, 6 missed, 2 false
+    assert verdict(truth, extra).f == 0
+    assert math.isnan(verdict(truth.take(slice(0, 0)), extra).f)
+
+
 def test_hand_computed_errors() -> None:
     truth = bed(1).take(slice(0, 3))
     picks = picks_of(
@@ -189,6 +198,23 @@ def test_calibration_is_one_for_honest_sigmas_and_shows_wrong_ones() -> None:
     assert values["calibration_position"] == pytest.approx(1, abs=0.1)
     assert values["calibration_diameter"] == pytest.approx(4, abs=0.5)
     assert values["calibration_tilt"] == pytest.approx(1)
+    for name in ("position", "diameter", "tilt"):
+        assert values[f"coverage_sigma_{name}"] == 1
+
+
+def test_calibration_is_that_of_the_rows_that_state_a_sigma() -> None:
+    truth = bed(5)
+    off = np.zeros((20, 3))
+    off[:, 0] = [0.001 * row for row in range(20)]
+    picks = picks_of(truth, position=off)
+    sigma = np.full((20, 3), np.nan)
+    sigma[[2, 4, 7]] = 0.001
+    judged = verdict(truth, replace(picks, sigma_position=sigma))
+    value = measure(events_of([judged]), 1, resamples=200)["calibration_position"]
+    assert value.n == 3
+    assert value.value == pytest.approx((4 + 16 + 49) / 3 / 3)  # a third: y and z are exact
+    assert 4 / 3 <= value.low < value.high <= 49 / 3
+    assert values_of(judged)["coverage_sigma_position"] == pytest.approx(3 / 20)
 
 
 def test_a_position_is_held_against_what_it_claims_to_be() -> None:

@@ -1,10 +1,12 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from pydantic import ValidationError
 from typer.testing import CliRunner
 
@@ -13,7 +15,8 @@ from mushpipe.cli import app
 from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.evaluate.calibrate import fit_correction
-from mushpipe.evaluate.plane import judge_planes, measure_plane, plane_values, window_of
+from mushpipe.evaluate.metrics import Value
+from mushpipe.evaluate.plane import PlaneRow, judge_planes, measure_plane, plane_values, window_of
 from mushpipe.sources.mcap import McapSource
 from mushpipe.stages.depth_correct import DepthCorrect
 from tests.evaluate.scenes import frame
@@ -64,6 +67,7 @@ def test_the_window_is_central() -> None:
     window = window_of(depth)
     assert window.shape == (31, 31)
     assert window[15, 15] == 1000
+    assert window_of(np.zeros((31, 40), np.float32)).shape == (31, 31)
     with pytest.raises(InputError, match="smaller"):
         window_of(np.zeros((30, 40), np.float32))
 
@@ -152,6 +156,37 @@ def test_a_calibration_needs_more_distances_than_its_order(tmp_path: Path) -> No
         measure_plane(plane(tmp_path, 0.51, 0.003, 0.001), 51.0, resamples=0)
     with pytest.raises(UsageError, match="--order 1 needs 2 distances, there are 1"):
         fit_correction([row, row], 1)
+
+
+def row_of(measured_m: float, error_mm: float) -> PlaneRow:
+    """Of an even plane that is measured there, with an error."""
+    values = {"mean_mm": 1e3 * measured_m, "offset_mm": error_mm, "flat_std_mm": 1.0}
+    known = {name: Value(value, np.nan, np.nan, 3) for name, value in values.items()}
+    return PlaneRow(f"at {measured_m}", measured_m - error_mm / 1e3, 3, known)
+
+
+def test_a_correction_is_a_polynomial_of_what_is_measured() -> None:
+    rows = [row_of(z, 2 - 1.5 * z + 0.8 * z**2) for z in (0.4, 0.5, 0.7, 1.0)]
+    found = fit_correction(rows, 2)
+    assert found.coefficients == pytest.approx([2, -1.5, 0.8])
+    assert found.left == pytest.approx([0] * 4, abs=1e-9)
+    told = yaml.safe_load(found.fragment())
+    assert told == {"offset_mm": 2, "slope_mm_per_m": -1.5, "curve_mm_per_m2": 0.8}
+
+
+def test_a_plane_without_depth_in_the_middle_corrects_nothing() -> None:
+    seen = row_of(0.5, 1.0)
+    unknown = dict.fromkeys(seen.values, Value(np.nan, np.nan, np.nan, 0))
+    with pytest.raises(InputError, match=r"at 0\.5: there is no depth in the middle"):
+        fit_correction([seen, replace(seen, values=unknown)], 0)
+
+
+def test_a_correction_says_what_it_leaves() -> None:
+    rows = [row_of(z, error) for z, error in ((0.4, 1.0), (0.5, 2.0), (0.6, 6.0))]
+    found = fit_correction(rows, 0)
+    assert found.coefficients == pytest.approx([3, 0, 0])
+    assert found.left == pytest.approx([-2, -1, 3])
+    assert "# at 0.6: 594.0 mm, error +6.000 mm, left over +3.000 mm\n" in found.fragment()
 
 
 def test_distances_that_are_not_those_of_the_planes_are_refused(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.recording import MANIFEST
 from mushpipe.core.truth import TRUTH_TOPIC, Ignore
+from mushpipe.core.wire import json_message, json_schema
 from mushpipe.evaluate.judging import Rules, judge_results
 from mushpipe.evaluate.labels import EXAMPLE, convert, parse_labels
 from mushpipe.evaluate.results import Results, of_picks
@@ -273,6 +274,56 @@ def test_labels_that_name_no_frame_are_in_that_of_the_camera(tmp_path: Path) -> 
         truth = TruthSet("labels.json", {place: FrameTruth(there)})
         judged = judge_results(results, truth, Rules())
         assert judged.notes == ["truth and results are in different frames: 3D errors are unknown"]
+    named = TruthSet("labels.json", {("index", 0): FrameTruth(there, frame_id=robot)})
+    assert judge_results(results, named, Rules()).notes == []
+
+
+@pytest.mark.parametrize(
+    ("carried", "exit_code", "missed"),
+    [(False, 0, 0), (False, 1, 1), (False, None, 1), (True, 0, 1)],
+)
+def test_frames_beyond_the_end_of_a_whole_run_may_be_of_another_recording(
+    tmp_path: Path, carried: bool, exit_code: int | None, missed: int
+) -> None:
+    stamps = [header(number).stamp_ns for number in range(3)]
+    span = {"stamp_ns": stamps[:2], "sequence": [0, 1]}
+    summary = {} if exit_code is None else {"exit_code": exit_code, "span": span}
+    frames = [(header(number), of_picks(picks_of(bed(number)))) for number in range(2)]
+    results = Results(tmp_path / "r.mcap", "/mushpipe/pick", frames, summary=summary)
+    recording = tmp_path / "truth.mcap" if carried else None
+    known = {("stamp_ns", stamps[number]): FrameTruth(bed(number)) for number in range(3)}
+    judged = judge_results(results, TruthSet("truth", known, recording=recording), Rules())
+    assert [len(verdict.matching.missed) for verdict in judged.verdicts] == [0, 0, 20][: 2 + missed]
+    assert judged.notes == [
+        "1 frames have no answer: all in them is missed"
+        if missed
+        else "1 frames of truth lie before or after what was played and are not judged"
+    ]
+
+
+def test_a_run_that_ended_early_is_told_of(tmp_path: Path) -> None:
+    summary = {"error": "the disk is full", "exit_code": 1}
+    frames = [(header(0), of_picks(picks_of(bed(0))))]
+    results = Results(tmp_path / "r.mcap", "/mushpipe/pick", frames, summary=summary)
+    truth = TruthSet("labels.json", {("index", 0): FrameTruth(bed(0))})
+    assert judge_results(results, truth, Rules()).notes == ["the run ended early: the disk is full"]
+
+
+def test_only_labels_may_be_of_another_recording(tmp_path: Path) -> None:
+    elsewhere = replace(picks_of(bed(0)), center=bed(0).center + np.array([0, 400]))
+    results = Results(tmp_path / "r.mcap", "/mushpipe/pick", [(header(0), of_picks(elsewhere))])
+    known = {("stamp_ns", header(0).stamp_ns): FrameTruth(bed(0))}
+    carried = TruthSet("bed.mcap", known, recording=tmp_path / "bed.mcap")
+    assert judge_results(results, carried, Rules()).notes == []
+    doubted = judge_results(results, TruthSet("labels.json", known), Rules()).notes
+    assert [note.partition(":")[0] for note in doubted] == [
+        "nothing was found where labels.json has a mushroom"
+    ]
+    labels = TruthSet("labels.json", known)
+    moved = np.where(np.arange(20)[:, None] == 0, bed(0).center, elsewhere.center)
+    for picks in (replace(elsewhere, center=moved), elsewhere.take(slice(0, 0))):  # one; nothing
+        results.frames[:] = [(header(0), of_picks(picks))]
+        assert judge_results(results, labels, Rules()).notes == []
 
 
 def test_numbers_of_frames_do_not_fit_a_run_that_began_later(tmp_path: Path) -> None:
@@ -282,6 +333,25 @@ def test_numbers_of_frames_do_not_fit_a_run_that_began_later(tmp_path: Path) -> 
     results = Results(tmp_path / "r.mcap", "/mushpipe/pick", frames, manifest=manifest)
     with pytest.raises(UsageError, match=r"counted from 0\.2 s on: label them by 'stamp_ns'"):
         judge_results(results, TruthSet("labels.json", {("index", 0): FrameTruth(there)}), Rules())
+    stamped = TruthSet("labels.json", {("stamp_ns", header(0).stamp_ns): FrameTruth(there)})
+    assert len(judge_results(results, stamped, Rules()).verdicts[0].matching.truth) == 20
+    # another source may keep the numbers of the recording
+    results.frames[:] = [(header(6), of_picks(picks_of(there)))]
+    numbered = TruthSet("labels.json", {("index", 6): FrameTruth(there)})
+    assert len(judge_results(results, numbered, Rules()).verdicts[0].matching.truth) == 20
+    results.frames.clear()
+    assert judge_results(results, numbered, Rules()).verdicts == []
+
+
+def test_what_is_no_truth_on_its_topic_is_refused(tmp_path: Path) -> None:
+    foreign = json_message(json_schema("mine.Truth", {}), header(0), {})
+    for name, value in (("mushpipe.Picks", picks_of(bed(0))), ("mine.Truth", foreign)):
+        path = tmp_path / f"{name}.mcap"
+        writer = RecordingWriter(path, {})
+        writer.value(TRUTH_TOPIC, value, header(0))
+        writer.close()
+        with pytest.raises(InputError, match=f"{TRUTH_TOPIC} holds '{name}', expected mushpipe.Tr"):
+            read_truth(path)
 
 
 def test_a_recording_without_truth_says_so(tmp_path: Path) -> None:

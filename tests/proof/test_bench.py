@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import resource
+import subprocess
+import sys
 import threading
 import tracemalloc
 from contextlib import suppress
@@ -15,8 +18,9 @@ import pytest
 
 from mushpipe import Circles, RgbdFrame, Stage
 from mushpipe.core.errors import InputError, UsageError
-from mushpipe.proof.bench import _peak_mb, bench, changes, read_baseline, slower
-from tests.core.lab import Lab, circles, cli
+from mushpipe.core.report import RunReport
+from mushpipe.proof.bench import _peak_mb, _Watch, bench, changes, conditions, read_baseline, slower
+from tests.core.lab import Frames, Lab, circles, cli
 
 ROOT = Path(__file__).parents[2]
 
@@ -41,6 +45,8 @@ def test_figures_of_a_small_graph(lab: Lab) -> None:
     )  # it waits, and then is worked on
     assert result["allocated_mb_per_frame"] == pytest.approx(8, abs=0.2)
     assert result["peak_memory_mb"] > 8
+    busy = result["cpu_ms_per_frame"] * result["frames_per_s"] / 1e3
+    assert result["cores_busy"] == pytest.approx(busy, rel=0.1, abs=0.02)  # both are rounded
     json.dumps(result)
 
 
@@ -78,6 +84,83 @@ def test_the_peak_is_that_of_the_run_without_what_tracing_needs(lab: Lab) -> Non
     assert result["peak_memory_mb"] <= round(before[0], 1)
 
 
+def test_the_peak_is_of_this_process_and_not_of_who_started_it() -> None:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    held = np.ones(20_000_000)  # 160 MB
+    assert _peak_mb() >= (held.nbytes + 0.9 * pages * resource.getpagesize()) / 1e6
+    code = "from mushpipe.proof.bench import _peak_mb; print(_peak_mb())"
+    alone = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert 10 < float(alone.stdout) < held.nbytes / 1e6
+
+
+def test_cpu_time_and_growth_are_those_between_frames() -> None:
+    watch = _Watch()
+    watch.seen_s = [7.0, 7.5, 8.0, 8.5]  # the first frame's own began before it was seen
+    assert watch.cpu_s() == pytest.approx(2.0)
+    watch.seen_mb = [0.0, 50.0, 100.0, 102.0, 0.0, 0.0, 0.0, 0.0, 110.0, 114.0]
+    assert watch.growth_mb() == pytest.approx(112 - 101)
+    watch.seen_mb = [0.0, 100.0, 103.0]
+    assert watch.growth_mb() == pytest.approx(3)
+
+
+def test_resident_memory_and_cpu_time_are_seen_at_each_frame() -> None:
+    watch = _Watch()
+    watch(RunReport())
+    held = np.ones(10_000_000)  # 80 MB
+    watch(RunReport())
+    assert watch.seen_mb[1] - watch.seen_mb[0] == pytest.approx(held.nbytes / 1e6, abs=8)
+    assert watch.seen_s[0] < watch.seen_s[1]
+
+
+def test_what_is_measured_was_warmed_up_before_and_is_traced_after(lab: Lab) -> None:
+    seen: list[Any] = []
+
+    class Notes(Allocates):
+        def open(self) -> None:
+            seen.append("open")
+
+        def process(self, frame: RgbdFrame) -> Circles:
+            seen.append(frame.header.sequence)
+            first = np.zeros(5_000_000 if frame.header.sequence == 0 else 1)  # 40 MB, once
+            return circles(1 + first.sum())
+
+        def close(self) -> None:
+            seen.append("close")
+
+    text = lab.chain(Notes)
+    result = bench(lambda count: lab.compile(text, f"source.count={count}"), 10)
+    runs = [["open", *range(frames), "close"] for frames in (3, 10, 5)]
+    assert seen == [step for run in runs for step in run]
+    assert result["allocated_mb_per_frame"] < 1
+
+
+def test_a_recording_is_the_same_wherever_it_lies(lab: Lab, tmp_path: Path) -> None:
+    class Recorded(Frames):
+        path: Path = Path("none")
+
+        def files(self) -> tuple[Path, ...]:
+            return (self.path,)
+
+    lab.registry.source("recorded", Recorded)
+    here, there = tmp_path / "here/bed.mcap", tmp_path / "there/bed.mcap"
+    found = []
+    for path in (here, there):
+        path.parent.mkdir()
+        path.write_bytes(b"mushrooms")
+        plan = lab.compile(lab.chain("threshold", source="recorded"), f"source.path={path}")
+        found.append(conditions(plan))
+    assert found[0]["recordings"][0]["file"] == "bed.mcap"
+    assert found[0] == found[1]
+
+
+def test_two_frames_are_enough_and_one_is_too_few(lab: Lab) -> None:
+    text = lab.chain("threshold")
+    result = bench(lambda count: lab.compile(text, f"source.count={min(count, 2)}"), 10)
+    assert result["frames"] == 2
+    with pytest.raises(InputError, match="one frame is too few"):
+        bench(lambda _: lab.compile(lab.chain("threshold"), "source.count=1"), 10)
+
+
 def test_a_source_without_frames_has_no_figures(lab: Lab) -> None:
     with pytest.raises(InputError, match="no frame"):
         bench(lambda _: lab.compile(lab.chain("threshold"), "source.count=0"), 10)
@@ -96,8 +179,9 @@ def figures(**medians: float) -> dict[str, Any]:
 
 
 def test_a_node_is_compared_with_itself_in_the_baseline() -> None:
-    found = slower(figures(a=3.0, b=1.0, new=2.0), figures(a=2.0, b=2.0, old=9.0, c=0.0))
-    assert found == pytest.approx({"a": 1.5, "b": 0.5, "all stages": 6 / 13})
+    now = figures(a=3.0, b=1.0, new=2.0, c=1.0)
+    found = slower(now, figures(a=2.0, b=2.0, old=9.0, c=0.0))  # of c too little to be told
+    assert found == pytest.approx({"a": 1.5, "b": 0.5, "all stages": 7 / 13})
 
 
 def test_what_had_no_frame_hides_nothing_that_became_slower() -> None:

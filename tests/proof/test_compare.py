@@ -8,13 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from foxglove.messages import CompressedImage, RawImage
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.writer import Writer
 
 from mushpipe import InputError, Mask, Picks, Trace
 from mushpipe.core.errors import UsageError
 from mushpipe.core.recorder import RecordingWriter
-from mushpipe.core.wire import TIMING, Message, foxglove_schema
+from mushpipe.core.wire import TIMING, Message, Schema, foxglove_schema
 from mushpipe.proof.compare import _by_path, _difference, _of_fields, compare
 from tests.core.lab import cli
 from tests.io.values import SIZE, make_frame, make_picks, record, trace_of
@@ -131,6 +133,82 @@ def test_a_missing_frame_is_named_with_its_file(base: Path, tmp_path: Path, turn
     assert len({d.topic for d in found}) == 4
 
 
+def test_recordings_that_have_no_frame_in_common_differ(base: Path, tmp_path: Path) -> None:
+    other = record(tmp_path / "o.mcap", [trace_of(make_frame(99), pick=make_picks())])
+    found = compare(base, other, topics="/mushpipe/pick")
+    assert found.messages == 0
+    texts = [difference.text for difference in found.differences]
+    assert texts == [f"only in {base}"] * FRAMES + [f"only in {other}"]
+
+
+def image(encoding: str, size: tuple[int, int], data: bytes, frame_id: str) -> Message:
+    width, height = size
+    step = len(data) // height if height else 0
+    kinds = {"encoding": encoding, "width": width, "height": height, "step": step}
+    encoded = RawImage(frame_id=frame_id, data=data, **kinds).encode()
+    return Message("", foxglove_schema("RawImage"), encoded)
+
+
+def compressed(data: bytes, frame_id: str) -> Message:
+    encoded = CompressedImage(frame_id=frame_id, data=data, format="jpeg").encode()
+    return Message("", foxglove_schema("CompressedImage"), encoded)
+
+
+CDR = Schema("sensor_msgs/msg/Imu", "ros2msg", b"float64 x", "cdr")
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "fields"),
+    [
+        (image("bgr8", (2, 1), b"abcdef", "a"), image("bgr8", (2, 1), b"abcdeg", "a"), {"data"}),
+        (image("mono8", (0, 0), b"", "a"), image("mono8", (0, 0), b"", "b"), {"frame_id"}),
+        (image("mono8", (2, 1), b"ab", "a"), image("mono8", (0, 0), b"", "a"), {"size", "pixels"}),
+        (compressed(b"", "a"), compressed(b"", "b"), {"frameId"}),
+        (Message("", CDR, b"1234"), Message("", CDR, b"1235"), {"bytes"}),
+    ],
+    ids=["of a foreign encoding", "empty", "one empty", "compressed to nothing", "of ROS"],
+)
+def test_messages_of_other_programs_are_compared_as_far_as_they_are_known(
+    ours: Message, theirs: Message, fields: set[str], tmp_path: Path
+) -> None:
+    paths = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
+    for path, message in zip(paths, (ours, theirs), strict=True):
+        writer = RecordingWriter(path, {})
+        writer.write("/other", message, make_frame().header)
+        writer.close()
+    assert {difference.field for difference in compare(*paths, 0.0).differences} == fields
+    assert compare(paths[0], paths[0]).differences == []
+
+
+def bare(path: Path, *messages: bytes, before: int = 0) -> Path:
+    """A recording of another program: JSON without a schema, all of one moment."""
+    writer = Writer(str(path))
+    writer.start()
+    first, channel = (writer.register_channel(topic, "json", 0) for topic in ("/first", "/other"))
+    for on, data in [(first, b"{}")] * before + [(channel, data) for data in messages]:
+        writer.add_message(on, log_time=5, data=data, publish_time=5, sequence=7)
+    writer.finish()
+    return path
+
+
+def test_each_of_several_messages_of_one_moment_is_compared(tmp_path: Path) -> None:
+    a = bare(tmp_path / "a.mcap", b'{"x": 1}', b'{"x": 2}')
+    b = bare(tmp_path / "b.mcap", b'{"x": 3}', b'{"x": 2}')
+    found = compare(a, b)
+    assert found.messages == 2
+    assert [(d.field, d.sequence, d.text) for d in found.differences] == [("x", 7, "1 against 3")]
+    assert compare(a, a).differences == []
+    assert len(compare(a, bare(tmp_path / "c.mcap", b'{"x": 1}')).differences) == 1
+    late = bare(tmp_path / "d.mcap", b'{"x": 1}', b'{"x": 2}', before=2)
+    assert [d.topic for d in compare(a, late).differences] == ["/first", "/first"]
+
+
+def test_a_field_that_one_message_lacks_is_named_with_the_other() -> None:
+    both, one = _by_path({"x": 1.0, "y": 2.0}), _by_path({"x": 1.0})
+    assert list(_of_fields(both, one, 1.0)) == [("y", "is only in the first")]
+    assert list(_of_fields(one, both, 1.0)) == [("y", "is only in the second")]
+
+
 def test_only_the_topics_that_were_asked_for(base: Path, tmp_path: Path) -> None:
     path = record(tmp_path / "m.mcap", traces(moved(1.0), mask()))
     found = compare(base, path, topics="/mushpipe/seg*")
@@ -241,6 +319,7 @@ def test_a_pixel_differs_however_many_of_its_channels_do() -> None:
     assert _difference(a, b, 0.01) == "2 of 100 pixels"
     assert _difference(a, b, 0.02) is None
     assert _difference(a, c, 0.0) == "1 of 100 pixels"
+    assert _difference(a, a[:99], 1.0) == "100 pixels against 99"
 
 
 @pytest.mark.parametrize("channels", [1, 4])
