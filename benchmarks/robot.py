@@ -29,6 +29,7 @@ import numpy as np
 
 from mushpipe import Header, Picks, RgbdFrame, RunInfo, Trace
 from mushpipe.core.geometry import quaternion_from_axis
+from mushpipe.proof.bench import peak_mb
 from mushpipe.robot.targets import Filter
 from mushpipe.sinks.robot_json import RobotJsonSink
 
@@ -186,7 +187,7 @@ def report(arguments: argparse.Namespace, found: dict[str, Any]) -> None:
         f"results missed by healthy clients: {missed}",
         f"the stuck client was cut off and came back {found['stuck'] - 1} times",
         f"CPU {100 * (usage.ru_utime + usage.ru_stime) / found['elapsed']:.0f} % of a core, "
-        f"peak memory {usage.ru_maxrss / 1024:.0f} MiB",
+        f"peak memory {peak_mb():.0f} MB",
         f"mushpipe {version('mushpipe')}, python {platform.python_version()}, "
         f"numpy {np.__version__}, orjson {version('orjson')}, {platform.platform()}",
     ]

@@ -48,7 +48,7 @@ def bench(plan_of: Callable[[int], Plan], frames: int) -> dict[str, Any]:
     if report.processed < LEAST_FRAMES:
         raise InputError(f"{plan_of(frames).file}: one frame is too few to measure CPU time with")
     cpu, elapsed = watch.cpu_s(), report.elapsed_s
-    summary, peak = report.summary(), _peak_mb()
+    summary, peak = report.summary(), peak_mb()
     return {
         **conditions(plan_of(frames)),
         "frames": report.processed,
@@ -130,7 +130,8 @@ class _Watch:
         return sum(late) / len(late) - sum(early) / len(early)
 
 
-def _peak_mb() -> float:
+def peak_mb() -> float:
+    """Return the largest memory that this process had so far, MB."""
     # getrusage would give the peak of the program that started this one, where that is larger
     lines = Path("/proc/self/status").read_text().splitlines()
     (kib,) = (line.split()[1] for line in lines if line.startswith("VmHWM:"))

@@ -19,7 +19,7 @@ import pytest
 from mushpipe import Circles, RgbdFrame, Stage
 from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.report import RunReport
-from mushpipe.proof.bench import _peak_mb, _Watch, bench, changes, conditions, read_baseline, slower
+from mushpipe.proof.bench import _Watch, bench, changes, conditions, peak_mb, read_baseline, slower
 from tests.core.lab import Frames, Lab, circles, cli
 
 ROOT = Path(__file__).parents[2]
@@ -76,7 +76,7 @@ def test_the_peak_is_that_of_the_run_without_what_tracing_needs(lab: Lab) -> Non
     class Traced(Allocates):
         def process(self, frame: RgbdFrame) -> Circles:
             if tracemalloc.is_tracing():
-                before.append(_peak_mb())
+                before.append(peak_mb())
             return circles(1 + np.ones(10_000_000 if before else 1)[0])
 
     text = lab.chain(Traced)
@@ -87,8 +87,8 @@ def test_the_peak_is_that_of_the_run_without_what_tracing_needs(lab: Lab) -> Non
 def test_the_peak_is_of_this_process_and_not_of_who_started_it() -> None:
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     held = np.ones(20_000_000)  # 160 MB
-    assert _peak_mb() >= (held.nbytes + 0.9 * pages * resource.getpagesize()) / 1e6
-    code = "from mushpipe.proof.bench import _peak_mb; print(_peak_mb())"
+    assert peak_mb() >= (held.nbytes + 0.9 * pages * resource.getpagesize()) / 1e6
+    code = "from mushpipe.proof.bench import peak_mb; print(peak_mb())"
     alone = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert 10 < float(alone.stdout) < held.nbytes / 1e6
 
