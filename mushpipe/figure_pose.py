@@ -28,8 +28,9 @@ def aligned(
 
     Args:
         trace: The frame.
-        settings: Of the stage `registration`, those of the best circles are registered.
-        chosen: Id of the mushroom's pick; without picks its row among the circles.
+        settings: Of the stage `registration`.
+        chosen: Id of the mushroom's pick; without picks its row among the circles. None takes
+            those of the best circles, up to `POSES`.
 
     Raises:
         UsageError: The frame has no depth, no circles, no locations, no such mushroom, or none that

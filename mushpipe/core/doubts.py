@@ -151,7 +151,7 @@ def bow(points: Floats) -> float:
 
     A plane has 1/z = a + b x/z + c y/z; its ranges are longer than z by the `_stretch` s of their
     rays, 1/range = (a + b x/z + c y/z) (1 + g (1/s - 1)) with g = 1. The g returned is that of
-    least squares without the farthest points, which caps are.
+    least squares, without what is far off the fit, as caps are.
 
     Args:
         points: (N, 3) m.
