@@ -61,7 +61,9 @@ OutOption = Annotated[Path | None, typer.Option(help="folder to keep the graph's
 ReportOption = Annotated[Path | None, typer.Option(help="folder for a page with plots")]
 
 
-calibrate_app = typer.Typer(help="Measure a camera's errors.", no_args_is_help=True)
+calibrate_app = typer.Typer(
+    help="Measure a camera: the errors of its depth, and which way is up.", no_args_is_help=True
+)
 
 
 def register(app: typer.Typer) -> None:
@@ -99,6 +101,19 @@ def calibrate_depth(
     _write(correction.fragment())
     if out is not None:
         write_text(out, correction.fragment())
+
+
+@calibrate_app.command("up")
+def calibrate_up(
+    recording: Annotated[Path, file_argument("of a camera at rest, with its IMU")],
+    topic: Annotated[str | None, typer.Option(help="of the readings, where there are more")] = None,
+) -> None:
+    """Find which way is up, for the setting `up`, from an accelerometer's readings."""
+    from mushpipe.console import set_up_logging
+    from mushpipe.evaluate.gravity import measure_up
+
+    set_up_logging(False)
+    _write(measure_up(recording, topic).fragment().rstrip())
 
 
 def evaluate(

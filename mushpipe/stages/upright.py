@@ -26,7 +26,7 @@ Up = Annotated[
     Literal["bed", "camera"] | Annotated[Vector, AfterValidator(_with_direction)],
     Field(
         description="the upright: the bed's normal, towards the camera, or a vector in its optical "
-        "frame: an accelerometer's reading at rest, which is gravity turned round"
+        "frame: an accelerometer's reading at rest, as 'mushpipe calibrate up' finds it"
     ),
 ]
 

@@ -1,0 +1,154 @@
+"""Which way is up for a camera that stands still, from the accelerometer in its recording."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mushpipe.core.arrays import Floats, Singles
+from mushpipe.core.errors import InputError, UsageError, suggest
+from mushpipe.core.recording import GARBAGE, RecordingReader
+from mushpipe.sources.decoding import Decoder
+from mushpipe.sources.mcap import McapSource
+from mushpipe.stages.upright import bed_normal, pixel_rays
+
+logger = logging.getLogger("mushpipe")
+IMU = "sensor_msgs/msg/Imu"
+STANDARD = 9.80665  # m/s^2
+TURNED_DEG = 20.0  # from the bed's normal; beds lie more level
+OFF = 0.1  # share of it; an accelerometer that is off by more, or in g, measures something else
+SWAY_DEG = 3.0  # root mean square; a camera that sways more does not stand still
+
+
+@dataclass(frozen=True, eq=False)
+class Upright:
+    """The mean reading of an accelerometer at rest.
+
+    Attributes:
+        topic: Where it stands.
+        frame_id: The frame of its axes, by its own name.
+        count: Number of readings.
+        up: (3,) unit vector against gravity, in that frame.
+        strength: m/s^2.
+        sway_deg: Root mean square angle of the readings about their mean, degrees.
+        beside_bed_deg: Angle to the normal of the bed as the first frame's depth shows it, degrees;
+            None without depth.
+    """
+
+    topic: str
+    frame_id: str
+    count: int
+    up: Floats
+    strength: float
+    sway_deg: float
+    beside_bed_deg: float | None
+
+    def fragment(self) -> str:
+        """Return what the setting `up` of a stage takes, with what it was found on, as YAML."""
+        x, y, z = (round(float(part), 4) for part in self.up)
+        bed = "" if self.beside_bed_deg is None else (
+            f", {self.beside_bed_deg:.1f} degrees from the bed's normal"
+        )  # fmt: skip
+        return (
+            f"# {self.count} readings of {self.topic}, along the axes of '{self.frame_id}': "
+            f"{self.strength:.2f} m/s^2, swaying by {self.sway_deg:.1f} degrees{bed}\n"
+            f"up: [{x}, {y}, {z}]\n"
+        )
+
+
+def measure_up(path: Path, topic: str | None = None) -> Upright:
+    """Return the upright of a recording, whose IMU has the axes of the colour camera.
+
+    Args:
+        path: The recording.
+        topic: Of the readings; needed where there are several.
+
+    Raises:
+        UsageError: There is no such file or topic, or one has to be chosen.
+        InputError: There are no readings, they are not of gravity alone, or along other axes than
+            the camera's as far as can be told.
+    """
+    reader = RecordingReader(path)
+    topic = topic or _only(path, reader)
+    read = list(_readings(reader, topic))
+    for damage in reader.damage:
+        logger.warning("%s: %s", path, damage)
+    values = np.array([acceleration for _, acceleration in read]).reshape(-1, 3)
+    if not len(values) or not np.isfinite(values).all():
+        raise InputError(f"{path}: {topic} holds no readings, or such as are no numbers")
+    mean = values.mean(axis=0)
+    strength = float(np.linalg.norm(mean))
+    if abs(strength - STANDARD) > OFF * STANDARD:
+        raise InputError(
+            f"{path}: {topic} reads {strength:.2f} m/s^2 in the mean, at rest it is {STANDARD:.2f}:"
+            " did the camera move, is it in g, or a gyroscope?"
+        )
+    up = mean / strength
+    across = np.linalg.norm(values - np.outer(values @ up, up), axis=1)
+    sway = float(np.degrees(np.sqrt((np.arctan2(across, values @ up) ** 2).mean())))
+    if sway > SWAY_DEG:
+        raise InputError(f"{path}: {topic} sways by {sway:.1f} degrees: the camera did not rest")
+    frame_id, beside = read[-1][0], _beside_bed(path, up)
+    if beside is None and not frame_id.endswith("optical_frame"):
+        raise InputError(
+            f"{path}: {topic} is along the axes of '{frame_id}', and there is no depth that would "
+            "show whether these are the camera's (x right, y down, z forward)"
+        )
+    if beside is not None and beside > TURNED_DEG:
+        raise InputError(
+            f"{path}: by {topic}, up is {beside:.0f} degrees from the normal of what depth shows: "
+            f"it is not the bed, or the axes of '{frame_id}' are not the camera's (x right, y "
+            "down, z forward)"
+        )
+    return Upright(topic, frame_id, len(values), up, strength, sway, beside)
+
+
+def _only(path: Path, reader: RecordingReader) -> str:
+    index = reader.index()
+    topics = [t for t in sorted(index.channels) if index.schema_name(t) == IMU and index.counts[t]]
+    accelerometers = [t for t in topics if "gyro" not in t] or topics
+    if len(accelerometers) == 1:
+        return accelerometers[0]
+    if not topics:
+        raise InputError(f"{path}: it holds no {IMU}, which an accelerometer's readings come in")
+    raise UsageError(f"{path}: which is it? --topic {' or --topic '.join(accelerometers)}")
+
+
+def _readings(reader: RecordingReader, topic: str) -> Iterator[tuple[str, tuple[float, ...]]]:
+    """Yield the frame and the acceleration, m/s^2, of each message."""
+    index = reader.index()
+    if topic not in index.channels:
+        hint = suggest(topic, sorted(index.channels))
+        raise UsageError(f"{reader.path}: there is no topic '{topic}'; {hint}")
+    if (found := index.schema_name(topic)) != IMU:
+        raise UsageError(f"{reader.path}: topic '{topic}' holds {found}, expected {IMU}")
+    decoder = Decoder()
+    for raw in reader.messages({topic}):
+        message = _decoded(decoder, raw, reader.path)
+        read = message.linear_acceleration
+        yield message.header.frame_id, (read.x, read.y, read.z)
+
+
+def _decoded(decoder: Decoder, raw: Any, path: Path) -> Any:
+    try:
+        return decoder.decode(raw)
+    except GARBAGE as error:
+        raise InputError(f"{path}: {raw.channel.topic} cannot be decoded: {error}") from error
+
+
+def _beside_bed(path: Path, up: Floats) -> float | None:
+    """Return the angle, degrees, between an upright and the bed's normal; None without depth."""
+    try:
+        frame = next(iter(McapSource(path=path, max_frames=1).frames()), None)
+    except InputError:  # a recording of the IMU alone
+        return None
+    if frame is None or frame.camera is None:
+        return None
+    depth: Singles = np.fmax(frame.depth_m, np.float32(0))
+    normal = bed_normal(depth, pixel_rays(frame.camera))
+    return None if normal is None else float(np.degrees(np.arccos(np.clip(normal @ up, -1, 1))))
