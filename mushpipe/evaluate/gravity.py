@@ -50,7 +50,7 @@ class Upright:
 
     def fragment(self) -> str:
         """Return what the setting `up` of a stage takes, with what it was found on, as YAML."""
-        x, y, z = (round(float(part), 4) for part in self.up)
+        x, y, z = (round(float(part), 4) + 0.0 for part in self.up)  # 0.0 for -0.0
         bed = "" if self.beside_bed_deg is None else (
             f", {self.beside_bed_deg:.1f} degrees from the bed's normal"
         )  # fmt: skip
