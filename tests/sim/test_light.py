@@ -9,6 +9,7 @@ import pytest
 
 from mushpipe.sim.light import Lamp, Rig, ambient, lit
 from mushpipe.sim.material import Paint
+from mushpipe.sim.raycast import Raycaster, rays
 from mushpipe.sim.render import Surface, look
 from mushpipe.sim.settings import SceneSettings
 from mushpipe.sim.world import World, view_at
@@ -125,3 +126,13 @@ def test_of_the_sky_s_light_neighbours_throw_a_part_back_warm(
     for where, back in ((surface.outlined, 0.28), (surface.owner < 0, 0.03)):
         expected = 0.5 * (0.4 + back * 0.6 * np.array([1.0, 0.93, 0.78]))
         np.testing.assert_allclose(light[where], np.tile(expected, (where.sum(), 1)), rtol=1e-5)
+
+
+def test_what_stands_beyond_the_lamp_casts_no_shadow() -> None:
+    corners = np.array([[-1.0, -1, 1], [1, -1, 1], [0, 2, 1]])
+    caster = Raycaster(corners, np.array([[0, 1, 2]]))
+    up = rays(np.zeros((2, 3)), np.array([[0, 0, 1.0], [0, 0, 2.0]]))
+    # distances count in lengths of the direction
+    assert caster.blocked(up, 0.9).tolist() == [False, True]
+    assert caster.blocked(up, 0.4).tolist() == [False, False]
+    assert caster.blocked(up, 1.1).tolist() == [True, True]
