@@ -3,10 +3,14 @@
 import numpy as np
 import pytest
 
+from mushpipe.sim.material import Paint
 from mushpipe.sim.photo import ColorCamera
+from mushpipe.sim.render import look
 from mushpipe.sim.scene import Scene
-from mushpipe.sim.sensor import DepthSensor, Exact, axial_sigma
+from mushpipe.sim.sensor import BASELINE, GRAZING, DepthSensor, Exact, axial_sigma
 from mushpipe.sim.settings import SceneSettings
+from mushpipe.sim.world import view_at
+from tests.sim.scenes import ball
 
 CLEAN = {
     "shadow": False,
@@ -159,3 +163,63 @@ def test_what_no_unit_can_say_is_lost_and_a_range_has_two_ends():
     assert (DepthSensor(**CLEAN, unit_mm=0.01).sense(far, 0, 0) == 0).all()
     with pytest.raises(ValueError, match="nearest, farthest"):
         DepthSensor(range_m=(1.5, 0.2))
+
+
+def holes(settings, world, gloss=1.0, **parts):
+    """What is lost of a world, and its surface; every pixel as glossy as said."""
+    view = view_at(settings, 0.0)
+    surface = look(world, view)
+    count = len(surface.depth)
+    paint = Paint(np.ones((count, 3)), np.full(count, gloss), surface.normal)
+    return DepthSensor(**(CLEAN | parts)).scan(world, view, surface, paint, 0).lost, surface
+
+
+def test_a_wet_plane_mirrors_the_projector_half_way_to_it(settings, build):
+    """Where the upright halves the angle between the ways to camera and projector, to 3 degrees."""
+    lost, surface = holes(settings, build(), highlights=True)
+    camera, projector = np.array([0, 0, 0.5]), np.array([-BASELINE, 0, 0.5])
+    ways = [place - surface.point for place in (camera, projector)]
+    half = sum(way / np.linalg.norm(way, axis=1, keepdims=True) for way in ways)
+    cosine = half[:, 2] / np.linalg.norm(half, axis=1)
+    assert lost.sum() > 500
+    np.testing.assert_array_equal(lost.ravel(), cosine > 0.9985)
+    u = np.nonzero(lost)[1].mean()
+    assert u == pytest.approx(
+        settings.camera().cx - settings.camera().fx * BASELINE / 2 / 0.5, abs=1
+    )
+    assert not holes(settings, build(), gloss=0.1, highlights=True)[0].any()
+
+
+def test_a_ball_is_lost_where_it_is_seen_at_a_grazing_angle(settings, build):
+    center = np.array([0.08, -0.05, 0.04])
+    lost, surface = holes(settings, build(ball(center, 0.03)), grazing=True)
+    normal = (surface.point - center) / 0.03
+    sight = np.array([0, 0, 0.5]) - surface.point
+    cosine = np.sum(normal * sight, axis=1) / np.linalg.norm(sight, axis=1)
+    on, clear = surface.outlined, np.abs(cosine - GRAZING) > 0.03
+    assert 20 < lost.sum() < on.sum() / 2
+    np.testing.assert_array_equal(lost.ravel()[on & clear], cosine[on & clear] < GRAZING)
+    assert not lost.ravel()[surface.owner < 0].any()
+
+
+def test_a_hole_in_a_cap_lies_around_its_top_and_a_share_of_the_caps_has_one(settings, build):
+    axis = np.array([0.3, 0.2, 1.0]) / np.linalg.norm([0.3, 0.2, 1.0])
+    centers = [np.array([x, y, 0.04]) for x in (-0.1, -0.03, 0.04, 0.11) for y in (-0.06, 0, 0.06)]
+    world = build(*(ball(center, 0.025, axis) for center in centers))
+    every, surface = holes(settings, world, cap_holes=1.0)
+    assert not every.ravel()[surface.owner < 0].any()
+    for k, center in enumerate(centers):
+        own = surface.owner == k
+        away = np.linalg.norm(surface.point[own] - (center + 0.025 * axis), axis=1) / 0.025
+        lost = every.ravel()[own]
+        assert lost[away < 0.07].all()
+        assert not lost[away > 0.23].any()
+        assert away[lost].max() < away[~lost].min()
+    some = holes(settings, world, cap_holes=0.5)[0].ravel()
+    assert 2 <= len(np.unique(surface.owner[some])) <= 10
+
+
+def test_what_is_too_near_is_missing(settings, build):
+    lost, surface = holes(settings, build(ball((0, 0, 0.03), 0.025)), range_m=(0.48, 1.5))
+    np.testing.assert_array_equal(lost.ravel(), surface.depth < 0.48)
+    assert lost.any()

@@ -100,6 +100,15 @@ def test_depth_tells_how_large_caps_are_in_the_image(
     assert stage.scaling(replace(near, depth=None)) == (1, None)
 
 
+def test_the_largest_cap_is_that_of_the_setting_at_the_depth_in_metres() -> None:
+    stage, frame = CapNet(radius_px=(8, None), largest_mm=60), first("first-bed")
+    assert frame.camera is not None
+    native = np.full(frame.color.shape[:2], 1600, np.uint16)
+    found, radius = stage.scaling(replace(frame, depth=native, depth_scale=1.25e-4))
+    assert radius == pytest.approx(0.03 * frame.camera.fx / 0.2)
+    assert found == pytest.approx(0.64)  # 92.6 px; a step of 0.8 is not enough
+
+
 def test_beside_depth_the_image_is_scaled_and_the_answer_scaled_back() -> None:
     """Caps stay where they are; without depth the whole image is looked at."""
     frame = first("first-bed")

@@ -122,6 +122,27 @@ def test_what_is_too_high_is_no_mushroom() -> None:
     assert found[25:45, 25:45].all()
 
 
+@pytest.mark.parametrize(
+    ("settings", "found"),
+    [
+        ({}, [False, True, True, True]),
+        ({"min_mm": 3}, [True, True, True, True]),
+        ({"min_mm": 20}, [False, False, True, True]),
+        ({"max_mm": 30}, [False, True, False, False]),
+        ({"smallest_px": 30}, [False, True, True, False]),
+    ],
+)
+def test_blocks_are_told_by_their_height_and_size(
+    settings: dict[str, float], found: list[bool]
+) -> None:
+    depth, blocks = plane(5), []
+    for x, side, high in ((40, 40, 0.005), (110, 40, 0.012), (180, 40, 0.04), (250, 20, 0.04)):
+        blocks.append((slice(100, 100 + side), slice(x, x + side)))
+        depth[blocks[-1]] -= high
+    region = Height.model_validate(settings).process(frame_of(depth)).foreground
+    assert [bool(region[block].mean() > 0.5) for block in blocks] == found
+
+
 def test_height_scales_to_half_at_the_middle() -> None:
     image = height_image(np.array([[-0.01, 0.0, 0.008, 0.016, 0.1, 0.2]], np.float32), 0.008, 0.15)
     np.testing.assert_allclose(image, [[0, 0, 0.5, 1, 1, 0]], atol=1e-6)

@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from mushpipe import Circles, Mask, RgbdFrame
 from mushpipe.core.plugins import load_registry
-from mushpipe.stages.phase_hough import PhaseHough
+from mushpipe.stages.phase_hough import Evidence, PhaseHough
 from tests.stages.scenes import HEADER, discs, frame_of, sphere_depth
 
 TRUTH = [(40.3, 41.7, 15.2), (100.6, 70.1, 20.7), (128.2, 25.9, 12.4)]
@@ -74,6 +74,47 @@ def test_a_cap_below_another_is_found_by_the_part_of_its_outline_that_is_free() 
 
 def test_edges_explained_by_one_circle_support_no_second_one() -> None:
     assert len(found(discs([(80, 60, 22)], 0.8, 0.15), min_score=0.05)) == 1
+
+
+@pytest.mark.parametrize(("edge", "dim"), [(0.2, True), (1.0, False)])
+def test_edges_much_weaker_than_the_strong_ones_are_none_if_so_asked(
+    edge: float, dim: bool
+) -> None:
+    image = np.maximum(discs([(45, 60, 20)], 0.85, 0.1), discs([(115, 60, 20)], 0.25, 0.1))
+    evidence = PhaseHough(edge=edge).gather(frame_of(image), Mask(image > 0.2))
+    assert evidence is not None
+    assert (evidence.edges.x > 80).any() == dim
+    assert (evidence.edges.x < 80).sum() > 60
+
+
+def test_grain_of_a_gray_level_is_no_edge() -> None:
+    image = np.random.default_rng(0).integers(100, 102, (120, 160)) / 255
+    evidence = PhaseHough().gather(frame_of(image), Mask(np.ones(image.shape, bool)))
+    assert evidence is not None
+    assert len(evidence.edges.x) == 0
+
+
+def test_the_mask_alone_is_looked_at_where_edges_are_taken_from_it() -> None:
+    image = discs(TRUTH, 0.8, 0.15)
+    ball = ((110 - 79.5) / 200 * 0.4, (60 - 59.5) / 200 * 0.4, 0.4)
+    alone = found(image, input="mask")
+    beside = found(image, sphere_depth(ball, 0.04, 0.4), input="mask")
+    assert (as_rows(alone) == as_rows(beside)).all()
+    assert (alone.score == beside.score).all()
+
+
+def test_what_is_a_cap_only_beside_an_unlikely_one_is_no_more_likely(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rows, chances = [2, 0, 1], np.array([0.3, 0.8, 0.9])
+
+    def decided(self: PhaseHough, evidence: Evidence, led: bool = False) -> tuple[np.ndarray, ...]:
+        n, owner = len(evidence.shapes), np.full(len(evidence.edges.x), -1, np.int32)
+        chance = np.concatenate([chances, np.zeros(n - 3)])
+        return np.array(rows, np.int32), chance, owner, np.zeros(n)
+
+    monkeypatch.setattr(PhaseHough, "decide", decided)
+    assert found(discs(TRUTH, 0.8, 0.15), evidence=0.05).score.tolist() == [0.9, 0.3, 0.3]
 
 
 @pytest.mark.parametrize(("long", "short"), [(23, 19), (25, 19)])

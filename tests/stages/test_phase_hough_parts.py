@@ -8,7 +8,12 @@ import pytest
 from mushpipe import Mask
 from mushpipe.stages.bed import far_cells, fit_plane, plane_depth
 from mushpipe.stages.discs import Radii, lens
-from mushpipe.stages.phase.decide import decide, outline_features, overlap_features
+from mushpipe.stages.phase.decide import (
+    decide,
+    neighbours,
+    outline_features,
+    overlap_features,
+)
 from mushpipe.stages.phase.depth import GRID, NO_RELIEF, closed, halved, relief_of
 from mushpipe.stages.phase.edges import edges_of, gradient_of, otsu_of
 from mushpipe.stages.phase.features import (
@@ -41,7 +46,7 @@ def edges(image: np.ndarray, threshold: float = 5.0) -> Strips:
 
 def static_row(
     image: np.ndarray,
-    shape: tuple[float, float, float],
+    shape: tuple[float, ...],
     mask: np.ndarray | None = None,
     height: np.ndarray = NO_RELIEF.height,
 ) -> tuple[dict[str, float], np.ndarray]:
@@ -49,7 +54,7 @@ def static_row(
     hits = np.full((1, DIRECTIONS), -2, np.int32)
     hits[0, : directions_of(shape[2])] = -1
     covered = ALL if mask is None else mask.astype(np.uint8)
-    outline = np.array([[*shape, 0.0, 0.0]])
+    outline = np.array([[*shape, 0.0, 0.0][:5]])
     residual = np.array([0.5], np.float32)
     relief = NO_RELIEF._replace(height=height, pixel=0.002)
     table, _ = static_features(gray, gradient_of(gray), covered, relief, outline, hits, residual)
@@ -143,6 +148,7 @@ def test_a_direction_under_an_accepted_circle_is_not_free() -> None:
     hidden = (n // 2 - n // 4) / n
     assert row[0] == pytest.approx(1 - hidden)
     assert row[1] == pytest.approx(quarter / (1 - hidden))
+    assert row[2] == pytest.approx(found.weight[0] * quarter / (1 - hidden))
     assert row[3] == pytest.approx(math.log(1 + n // 4))
     above = np.array([[80.0, 45, 16, 0, 0]])
     outline_features(found, shape, hits, owner, above, row, scratch)
@@ -150,6 +156,69 @@ def test_a_direction_under_an_accepted_circle_is_not_free() -> None:
     owner[0] = 1
     outline_features(found, shape, hits, owner, np.zeros((0, 5)), row, scratch)
     assert row[1] == row[2] == row[3] == 0
+
+
+def test_what_lies_beyond_the_image_is_no_part_of_an_outline() -> None:
+    found, n = edges(discs([(80, 60, 20)], 0.8, 0.1)), directions_of(20)
+    hits = np.full(DIRECTIONS, -2, np.int32)
+    beyond = np.cos(2 * np.pi * np.arange(n) / n) < -0.01
+    hits[:n] = np.where(beyond, HIDDEN, -1)
+    row, owner = np.zeros(7), np.full(len(found.x), -1, np.int32)
+    shape, scratch = np.array([0.0, 60, 20, 0, 0]), scratch_for(len(found.x))
+    outline_features(found, shape, hits, owner, np.zeros((0, 5)), row, scratch)
+    assert row[0] == 1
+
+
+def test_neighbours_are_all_whose_circles_meet_or_nearly_so() -> None:
+    rng = np.random.default_rng(5)
+    shapes = np.column_stack(
+        [rng.uniform(0, 300, (60, 2)), rng.uniform(5, 40, 60), np.zeros((60, 2))]
+    )
+    first, beside = neighbours(shapes)
+    for k, (x, y, r, *_) in enumerate(shapes):
+        away = np.hypot(shapes[:, 0] - x, shapes[:, 1] - y) - shapes[:, 2] - r
+        expected = set(np.flatnonzero(away < 4)) - {k}
+        assert set(beside[first[k] : first[k + 1]]) == expected
+
+
+def test_a_peak_lies_in_the_middle_of_its_cell_and_phase_0_is_the_middle_radius() -> None:
+    total, size = np.zeros((30, 40, 2), np.float32), np.zeros((30, 40), np.float32)
+    for (v, u), value in {(10, 20): 1.0, (10, 19): 0.5, (10, 21): 0.5, (20, 8): 0.7}.items():
+        total[v, u, 0] = size[v, u] = value
+    total[20, 8] = 0, 0.7  # a quarter of a turn on
+    found = peaks(total, size, 0.6, Radii(8.0, 32.0))
+    # of 4 times as large the middle is twice; a cell is 2 px wide
+    quarter = 8 * 4 ** (0.5 + 0.25 / (1 - GAP))
+    expected = [[40.5, 20.5, 16, 1.0], [16.5, 40.5, quarter, 0.7]]
+    assert found == pytest.approx(np.array(expected), rel=1e-4)
+
+
+def test_oval_and_texture_by_hand() -> None:
+    ramp = 0.2 + 0.005 * np.arange(160) + np.zeros((120, 1))  # 0.6 at x = 80
+    row, _ = static_row(ramp, (80, 60, 20, 3, 4))
+    assert row["oval"] == pytest.approx(5 / 20)
+    assert row["texture"] == pytest.approx(0.005 * 20 / 0.6, rel=0.02)
+
+
+def test_roughness_is_what_a_smooth_surface_leaves_and_a_spot_bends_nothing() -> None:
+    image, grain = np.full((120, 160), 0.5), np.random.default_rng(0).choice([-1, 1], (60, 80))
+    row, _ = static_row(image, (80, 60, 20), None, (0.02 + 0.001 * grain).astype(np.float32))
+    assert row["roughness"] == pytest.approx(0.001 / 0.04, rel=0.15)
+    flat = np.full((60, 80), 0.02, np.float32)
+    assert static_row(image, (80, 60, 20), None, flat)[0]["roughness"] < 1e-3
+    flat[27:32, 45:48] = 0.03
+    assert static_row(image, (80, 60, 20), None, flat)[0]["bend_large"] < 0.03
+
+
+def test_a_stem_is_one_whichever_way_it_lies() -> None:
+    v, u = np.mgrid[:60, :80].astype(float)
+    x, y = (2 * u + 0.5 - 80) * 0.002, (2 * v + 0.5 - 60) * 0.002
+    for turn in np.radians([0, 30, 45, 100]):
+        across = np.cos(turn) * y - np.sin(turn) * x
+        height = np.sqrt(np.maximum(0.04**2 * 1.2 - across**2, 0)).astype(np.float32)
+        row, _ = static_row(np.full((120, 160), 0.5), (80, 60, 20), None, height)
+        assert row["bend_small"] == pytest.approx(0, abs=0.06)
+        assert row["bend_large"] > 0.7
 
 
 def test_image_features_of_a_disc_by_hand() -> None:

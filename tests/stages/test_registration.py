@@ -10,7 +10,7 @@ from mushpipe import Circles, DepthSource, InputError, Locations
 from mushpipe.core.errors import DependencyError, UsageError
 from mushpipe.core.truth import TRUTH_TOPIC
 from mushpipe.stages.nearest_depth import NearestDepth
-from mushpipe.stages.registration import Registration
+from mushpipe.stages.registration import Registration, _inside
 from mushpipe.stages.upright_model import made, read
 from tests.stages.caps import angle, cap, circles_of, draw, frame_from
 from tests.stages.frames import simulated
@@ -44,7 +44,7 @@ def seen(tilt: float, turn: float, noise: float = 0.0) -> tuple[np.ndarray, np.n
 
 
 @pytest.mark.parametrize("local", ["point-to-point", "point-to-plane"])
-@pytest.mark.parametrize("start", ["none", "fgr"])
+@pytest.mark.parametrize("start", ["none", "fgr", "ransac"])
 def test_a_clean_cloud_of_the_model_itself_is_found(local: str, start: str) -> None:
     found = stage(model="cap", local=local, **{"global": start})
     for tilt, turn in [(0, 0), (12, 40), (20, 200)]:
@@ -218,6 +218,52 @@ def test_a_model_of_the_users_own_is_read_in_any_unit(tmp_path, capfd) -> None:
     assert (model.normals[upper] * model.points[upper]).sum(axis=1).min() > 0
 
 
+def test_the_normal_vector_of_a_model_that_leans_does_so_too_and_points_up(tmp_path) -> None:
+    own, up = made(full=False, spacing=0.05), np.array([0, 0, 1.0])
+    for tilt, turn in ((9, 20), (9, 200), (9, 110)):
+        lean = Rotation.from_euler("zyx", [turn, tilt, 0], degrees=True)
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(lean.apply(own.points)))
+        o3d.io.write_point_cloud(str(tmp_path / "m.ply"), cloud)
+        axis = read(tmp_path / "m.ply", 0.1).axis
+        assert angle(axis, lean.apply(up)) < 9 - 1 < angle(up, lean.apply(up))
+
+
+@pytest.mark.parametrize("full", [True, False])
+def test_the_projects_mushroom_is_an_ellipsoid_over_a_rolled_margin_and_a_stem(full: bool) -> None:
+    spacing = 0.06
+    model = made(full, spacing)
+    rho, z = np.hypot(*model.points[:, :2].T), model.points[:, 2]
+    outward = (model.points[:, :2] * model.normals[:, :2]).sum(axis=1) / rho
+    upward = model.normals[:, 2]
+    assert np.linalg.norm(model.normals, axis=1) == pytest.approx(1)
+
+    def belongs(part: np.ndarray, off: np.ndarray, out: np.ndarray, up: np.ndarray) -> None:
+        """Points lie on a curve, their normals as its gradient, but for where two meet."""
+        assert np.abs(off[part]).max() < 0.01
+        size = np.hypot(out, up)
+        cosine = ((outward * out + upward * up) / size)[part]
+        assert np.mean(cosine > 0.99) > 0.85
+        assert cosine.min() > 0.6
+
+    dome, margin = z >= 0, (z < 0) & (rho > 0.75)
+    belongs(dome, rho**2 + (z / 0.62) ** 2 - 1, rho, z / 0.62**2)
+    bend = (rho - 0.75) / 0.25
+    belongs(margin, bend**2 + (z / 0.2) ** 2 - 1, bend / 0.25, z / 0.2**2)
+    under, stem = (z < 0) & (rho <= 0.75) & (rho > 0.401), (z < 0) & (rho <= 0.401)
+    assert under.any() == stem.any() == full
+    if full:
+        belongs(under, z + 0.2, np.zeros_like(z), -np.ones_like(z))
+        belongs(stem, rho - 0.4, np.ones_like(z), np.zeros_like(z))
+        assert z.min() == pytest.approx(-1.6, abs=spacing)
+        assert stem.sum() * spacing**2 == pytest.approx(2 * np.pi * 0.4 * 1.4, rel=0.05)
+        assert under.sum() * spacing**2 == pytest.approx(np.pi * (0.75**2 - 0.4**2), rel=0.15)
+    e = np.sqrt(1 - 0.62**2)  # half an oblate spheroid
+    area = np.pi * (1 + 0.62**2 / e * np.arctanh(e))
+    assert dome.sum() * spacing**2 == pytest.approx(area, rel=0.06)
+    assert model.top == pytest.approx(z.max(), abs=0.01)
+    assert model.axis.tolist() == [0, 0, 1]
+
+
 def test_a_file_without_points_is_an_input_error(tmp_path) -> None:
     (tmp_path / "empty.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nend_header\n")
     with pytest.raises(InputError, match="0 points"):
@@ -259,3 +305,54 @@ def test_a_model_that_slid_off_gives_no_pose(local: str, start: str) -> None:
             assert np.linalg.norm(found.apex - (center + 0.62 * 0.02 * axis)) < 0.02
             assert angle(found.axis, axis) < 60
     assert local == "point-to-plane" or poses == 4
+
+
+@pytest.mark.parametrize("steepest", [30, 60])
+def test_a_motion_that_no_mushroom_makes_is_told_from_one_that_it_may(steepest: float) -> None:
+    found, top = stage(steepest_deg=steepest), 0.62 * UP
+
+    def stayed(lean: float, *shift: float) -> bool:
+        moved = np.eye(4)
+        moved[:3, :3] = Rotation.from_euler("x", lean, degrees=True).as_matrix()
+        moved[:3, 3] = shift
+        return found._stayed(moved, UP, top)
+
+    assert stayed(steepest - 1, 0, 0, 0)
+    assert not stayed(steepest + 1, 0, 0, 0)
+    for axis in np.eye(3):
+        assert stayed(0, *(0.99 * axis))
+        assert not stayed(0, *(1.01 * axis))
+    # turned by 29 degrees the top goes 0.3 radii towards +y, and 0.8 on is too far for it alone
+    assert stayed(29, 0, -0.8, 0)
+    assert not stayed(29, 0, 0.8, 0)
+
+
+def test_a_patch_of_a_cap_lies_on_too_little_of_a_whole_mushroom() -> None:
+    points, _ = seen(0, 0)
+    center = np.array([0.03, -0.02, 0.4])
+    patch = points[np.hypot(*(points - center)[:, :2].T) < 0.42 * 0.02]
+    for model, known in (("cap", True), ("mushroom", False)):
+        found = stage(model=model, **{"global": "none"}).register(patch, center, 0.02, UP)
+        assert (found is not None) == known
+
+
+def test_the_points_of_a_mushroom_are_those_in_its_circle_at_about_its_depth() -> None:
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(0.3, 0.4, (40, 50)).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.2] = 0
+    rays = rng.uniform(-0.5, 0.5, (40, 50, 2)).astype(np.float32)
+    rays[rng.random(depth.shape) < 0.1] = 1e6
+    for center, radius in (((24.3, 19.6), 12.0), ((2.0, 37.0), 9.0), ((-30.0, 5.0), 9.0)):
+        places = [
+            (v, u)
+            for v, u in np.ndindex(40, 50)
+            if depth[v, u] > 0 and np.hypot(u - center[0], v - center[1]) <= radius
+        ]
+        middle = np.median([depth[place] for place in places]) if places else 0.0
+        expected = [
+            (*(rays[place] * depth[place]), depth[place])
+            for place in places
+            if middle - 0.8 * 0.03 < depth[place] < middle + 0.03 and rays[place][0] < 1e3
+        ]
+        found = _inside(depth, rays, np.array(center), radius, 0.03)
+        assert found == pytest.approx(np.array(expected).reshape(-1, 3), rel=1e-6)
