@@ -89,8 +89,9 @@ def _points(o3d: Any, path: Path) -> Floats:
 def read(path: Path, spacing: float) -> Model:
     """Read a mesh or cloud of an upright mushroom, z up, in any unit.
 
-    Its rim is where it is widest. Its normal vector is that of the points' smallest principal
-    axis, turned upwards: for a model that does not stand quite upright.
+    Its rim is where it is widest. Its normal vector is the smallest principal axis of the points
+    above the rim, turned upwards. Of a model that leans it shows a part of that only, since they
+    are cut off level: poses are then off by the rest.
 
     Raises:
         UsageError: There is no such file.
