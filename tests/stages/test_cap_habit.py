@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mushpipe import Camera
 from mushpipe.stages.cap.habit import HELD, NARROWEST, SCENES, spread_of, usual_aspect
 from mushpipe.stages.cap.linear import cholesky
 from mushpipe.stages.cap.model import UNKNOWNS
@@ -72,6 +73,19 @@ def test_a_cap_that_leans_among_upright_ones_is_let_go() -> None:
     # of t with 4 degrees of freedom: (4 + tilt^2 / spread^2) / (4 + 2) times the variance
     assert out[:-1] == pytest.approx(np.full(500, NARROWEST * np.sqrt(4 / 6)), rel=0.01)
     assert out[-1] == pytest.approx(np.sqrt((4 * NARROWEST**2 + 0.25) / 6), rel=0.01)
+
+
+def test_where_all_stand_upright_the_tilt_of_one_is_better_known_than_where_all_lean() -> None:
+    small, sigmas = Camera(160, 120, 200, 200, 79.5, 59.5), []
+    places = [(x, y) for x in (-0.08, 0.0, 0.08) for y in (-0.04, 0.04)]
+    for tilt in (0, 25):
+        caps = [cap(tilt, 60 * k, (*place, 0.4), 0.02, 0.6) for k, place in enumerate(places)]
+        depth, gray = draw(caps, 0.44, small)
+        depth += np.random.default_rng(0).normal(0, 0.002, depth.shape)
+        stage = CapFit(up="camera", edge_offset_px=0, depth_noise_mm=2, depth_noise_per_m=0)
+        poses = stage.process(frame_from(depth, gray, small), circles_of(caps, small))[1]
+        sigmas.append(np.median(poses.sigma_rad))
+    assert sigmas[0] < 0.8 * sigmas[1]
 
 
 def test_the_variance_of_the_aspect_is_that_of_the_inverse() -> None:
