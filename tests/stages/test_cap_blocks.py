@@ -15,6 +15,7 @@ from mushpipe.stages.cap.blocks import (
     SPREAD,
     Image,
     K,
+    Sensor,
     U,
     V,
     average,
@@ -22,7 +23,19 @@ from mushpipe.stages.cap.blocks import (
     own_depth,
     room_to_cut,
 )
-from mushpipe.stages.cap.samples import COMPASS, DIRECTIONS, INNER, RADII, STEP, follow
+from mushpipe.stages.cap.samples import (
+    COMPASS,
+    DIRECTIONS,
+    INNER,
+    POINT_SHARE,
+    RADII,
+    STEP,
+    follow,
+    normalise,
+    ray_at,
+    sample_depth,
+)
+from tests.stages.caps import CAMERA, image_of
 
 WIDTH, HEIGHT = 64, 48
 PLACES = st.tuples(st.floats(-10, 74), st.floats(-10, 58), st.floats(4, 30))
@@ -130,3 +143,71 @@ def test_the_median_is_that_of_numpy(values: list[float]) -> None:
     room = np.array(values, np.float32)
     expected = np.median(room) if values else 0.0
     assert median(room, len(room)) == pytest.approx(expected, rel=1e-6)
+
+
+def sampled(depth: np.ndarray, circle: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, int, float]:
+    """The rays (6, n) of the points in a circle, how many are of other depth, and their depth."""
+    image, cut = image_of(depth), room_to_cut(*depth.shape)
+    out = np.full((6, len(CELLS)), np.nan, np.float32)
+    window = own_depth(image, 0, circle, 1.45, cut.own)
+    n, other, middle = sample_depth(window, cut, image, circle, sensor, out)
+    normalise(out, n)
+    return out[:, :n].astype(float), other, middle
+
+
+def test_points_lie_where_their_pixels_are_and_are_as_sure_as_the_sensor_says() -> None:
+    """A plane that slopes: the mean of a block is the depth of its middle."""
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    depth = 0.4 + 1e-4 * (u - 200) - 5e-5 * (v - 80)
+    circle, sensor = np.array([230.3, 60.6, 30.0]), Sensor(0.0003, 0.0012, 0.005, 0.0)
+    rays, other, middle = sampled(depth, circle, sensor)
+    assert rays.shape[1] == len(CELLS)
+    assert other == 0
+    pixels = np.floor(circle[:2] + circle[2] * CELLS + 0.5).astype(int)
+    z = depth[pixels[:, 1], pixels[:, 0]]
+    points = CAMERA.deproject(pixels.astype(float), z - sensor.bias)
+    assert pytest.approx(points, abs=1e-7) == (rays[:3] * rays[3]).T
+    assert np.linalg.norm(rays[:3], axis=0) == pytest.approx(1)
+    assert middle == pytest.approx(np.median(z), abs=5e-4)
+    # of 5 by 5 pixels, whose noise is in part common to all; along the ray it is longer
+    sigma = (sensor.noise + sensor.growth * z) * (0.3 + 0.7 / 5) / rays[2]
+    assert rays[4] == pytest.approx(sigma, rel=1e-4)
+    assert rays[5] == pytest.approx(POINT_SHARE)
+
+
+@pytest.mark.parametrize("place", [(100.3, 50.6), (7.0, 239.4), (-20.3, 251.7), (331.2, -8.4)])
+def test_the_ray_of_any_place_is_the_cameras(place: tuple[float, float]) -> None:
+    ray = CAMERA.deproject(np.array([place]), np.ones(1))[0]
+    found = ray_at(image_of(np.full((CAMERA.height, CAMERA.width), 0.4)), *place)
+    assert found == pytest.approx(ray / np.linalg.norm(ray), abs=1e-7)
+
+
+@pytest.mark.parametrize("elsewhere", [0.6, 0.2])
+def test_what_lies_elsewhere_in_a_circle_is_counted_and_left_out(elsewhere: float) -> None:
+    """In the middle the cap, around it more of something else; and what is hardly seen."""
+    depth = np.full((CAMERA.height, CAMERA.width), 0.4)
+    circle, half = np.array([160.0, 120.0, 33.0]), 3
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    around = np.hypot(u - 160, v - 120) > 0.62 * 33
+    depth[around] = elsewhere
+    sparse = (u < 155) & (u % 4 > 0)
+    depth[sparse] = np.nan
+    rays, other, middle = sampled(depth, circle, Sensor(0.0003, 0.0012, 0.0, 0.0))
+    inside = outside = 0
+    for x, y in np.floor(circle[:2] + 33 * CELLS + 0.5).astype(int):
+        block = np.s_[y - half : y + half + 1, x - half : x + half + 1]
+        if (~sparse[block]).mean() > 0.4:
+            seen = around[block][~sparse[block]]
+            inside, outside = inside + (not seen.any()), outside + seen.all()
+    assert middle == pytest.approx(0.4)
+    assert rays[3] * rays[2] == pytest.approx(0.4)
+    assert (rays.shape[1], other) == (inside, outside)
+    assert outside > inside > 10
+
+
+def test_in_a_small_circle_each_pixel_counts_once() -> None:
+    depth = np.full((CAMERA.height, CAMERA.width), 0.4)
+    circle = np.array([160.2, 120.3, 3.0])
+    rays, _, _ = sampled(depth, circle, Sensor(0.0003, 0.0012, 0.0, 0.0))
+    pixels = {tuple(place) for place in np.floor(circle[:2] + 3.0 * CELLS + 0.5)}
+    assert rays.shape[1] == len(pixels) < len(CELLS)

@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 
 from mushpipe import Camera, Circles
 from mushpipe.stages.cap.circle import circle_around, improve
-from mushpipe.stages.cap.model import SIZE, span
-from mushpipe.stages.cap.outline import LANES_ROOM
+from mushpipe.stages.cap.model import ROOM as MOST
+from mushpipe.stages.cap.model import SIZE, UNKNOWNS, fill_rows, span
+from mushpipe.stages.cap.outline import LANES_ROOM, sample_outline
 from mushpipe.stages.cap.samples import COMPASS, DIRECTIONS
 from mushpipe.stages.cap_fit import CapFit
 from tests.stages.caps import CAMERA, Cap, cap, circle_of, circles_of, draw, frame_from, image_of
@@ -61,6 +62,28 @@ def test_a_cap_that_the_image_does_not_show_has_the_circle_of_its_outline(
         circle, parameters(true), (16.0, 0.0), 1.0, image_of(np.zeros((240, 320)), camera), ROOM
     )
     assert np.abs(circle - outline).max() < 0.2
+
+
+@pytest.mark.parametrize("off", [0.0, 2.0])
+def test_the_outline_in_colour_is_where_the_cap_ends_and_no_nearer_one_covers_it(
+    off: float,
+) -> None:
+    true, rays = cap(10, 200, (0, 0, 0.4), 0.022, 0.55), np.zeros((6, DIRECTIONS), np.float32)
+    luma = draw([true], 0.44)[1].astype(np.float32)
+    circle = np.array(circle_of(true))
+    circle[0] += off
+    state, image = parameters(true), image_of(np.zeros((240, 320)))
+    # a nearer one covers the right half of the image
+    half = image._replace(ranks=image.ranks.copy())
+    half.ranks[:, 160:] = 0
+    for each, count in ((image, DIRECTIONS), (half, DIRECTIONS // 2)):
+        n = sample_outline(luma, each, 1, state, circle, 1.5, ROOM, rays)
+        assert abs(n - count) <= 1
+        rows = np.zeros(14 * MOST, np.float32)
+        fill_rows(state, rays, n, rows)
+        pixel = true.center[2] / CAMERA.fx
+        assert np.abs(rows[UNKNOWNS * MOST :][:n]).max() < 0.35 * pixel
+        assert rays[4, :n] == pytest.approx(1.5 * pixel)
 
 
 def test_a_circle_is_drawn_to_the_cap_where_a_neighbour_hides_the_image_of_it() -> None:

@@ -102,6 +102,17 @@ def test_a_diameter_is_twice_a_radius_and_so_is_its_sigma() -> None:
     np.testing.assert_array_equal(found.sigma_position, fits.sigma_surface)
 
 
+@pytest.mark.parametrize("circle_px", [0.5, 2.0])
+def test_where_the_ray_is_the_axis_a_point_is_as_sure_across_as_its_circle(
+    circle_px: float,
+) -> None:
+    true = cap(0, 0, (0, 0, 0.4), 0.02, 0.6)
+    locations, _ = fit([true], circle_sigma_px=circle_px)
+    across = circle_px / CAMERA.fx * true.apex[2]
+    assert locations.sigma_position[0, :2] == pytest.approx(across, rel=0.01)
+    assert 1e-5 < locations.sigma_position[0, 2] < 1e-3
+
+
 def test_edges_that_are_off_widen_the_sigmas_by_their_share_of_the_radius() -> None:
     """2 px of 40 are 0.05: of a cap 40 mm wide half of 2 mm, and of a tilt 1.5 times as much."""
     locations = Locations.unknown(2, diameter=[0.04, np.nan], sigma_diameter=[0.0005, np.nan])

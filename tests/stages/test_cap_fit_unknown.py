@@ -101,6 +101,28 @@ def test_where_tilt_cannot_be_seen_the_sigma_says_so() -> None:
     assert ball.sigma_rad[0] > 2 * flat.sigma_rad[0]
 
 
+def test_the_fitness_of_a_cap_is_less_by_what_is_missing_of_it() -> None:
+    true = cap(0, 0, (0, 0, 0.4), 0.022, 0.55)
+    depth, gray = draw([true], 0.44)
+    circles, stage, found = circles_of([true]), CapFit(up="camera"), []
+    for first_row in (0, 120):  # all of it; the lower half
+        part = np.where(np.arange(240)[:, None] < first_row, np.nan, depth)
+        found.append(stage.process(frame_from(part, gray), circles)[1].fitness[0])
+    assert found[1] / found[0] == pytest.approx(0.5, abs=0.08)
+
+
+def test_a_cap_of_which_little_is_seen_between_others_may_be_anywhere_there() -> None:
+    true = cap(0, 0, (0, 0, 0.4), 0.022, 0.55)
+    depth, gray = draw([true], 0.44)
+    v, u = np.mgrid[:240, :320]
+    over = (np.abs(u - 160) > 11) & (np.hypot(u - 160, v - 120) < 30)
+    circles, stage = circles_of([true]), CapFit(up="camera")
+    clear, _, _ = stage.process(frame_from(depth, gray), circles)
+    hidden, _, _ = stage.process(frame_from(np.where(over, 0.34, depth), gray), circles)
+    assert (clear.sigma_position < 0.002).all()
+    assert (hidden.sigma_position > hidden.diameter[0] / 2).all()
+
+
 @pytest.mark.parametrize("aspect", [0.2, 0.5, 0.7])
 @pytest.mark.parametrize("correlation", [-0.7, 0.0, 0.8])
 def test_the_sigma_of_a_tilt_is_the_mean_over_what_the_aspect_may_be(

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mushpipe.stages.cap.habit import HELD, SCENES, usual_aspect
+from mushpipe import Camera
+from mushpipe.stages.cap.habit import HELD, NARROWEST, SCENES, spread_of, usual_aspect
 from mushpipe.stages.cap.linear import cholesky
 from mushpipe.stages.cap.model import UNKNOWNS
 from mushpipe.stages.cap.solve import variance_of_aspect
@@ -39,6 +40,52 @@ def test_caps_without_a_fit_say_nothing() -> None:
     some = np.array([0.9, -1.0, 0.8]), np.array([0.01, 1.0, 0.02])
     left = np.array([0.9, 0.8]), np.array([0.01, 0.02])
     assert usual_aspect(*some, USUAL, SIGMA) == usual_aspect(*left, USUAL, SIGMA)
+
+
+def spreads(true: np.ndarray, sigma: float, prior: float) -> np.ndarray:
+    """What tilts (N, 2) say that were measured so well and fitted with a prior; NaN: none is."""
+    measured = true + np.random.default_rng(1).normal(0, sigma, true.shape)
+    variance = 1 / (1 / sigma**2 + 1 / prior**2)
+    fitted = measured * variance / sigma**2
+    squares = np.where(np.isnan(true[:, 0]), -1.0, (fitted**2).sum(axis=1))
+    out = np.empty(len(true))
+    spread_of(squares, np.full(len(true), variance), prior, out)
+    return out
+
+
+@pytest.mark.parametrize("spread", [0.08, 0.2])
+@pytest.mark.parametrize("sigma", [0.005, 0.05])
+@pytest.mark.parametrize("prior", [0.15, 0.4])
+def test_the_spread_of_tilts_is_the_one_they_were_drawn_with(
+    spread: float, sigma: float, prior: float
+) -> None:
+    """Student's t of 4 degrees of freedom; a cap without a fit gets the spread itself."""
+    rng = np.random.default_rng(0)
+    scale = spread / np.sqrt(rng.chisquare(4, (4000, 1)) / 4)
+    true = np.vstack([rng.normal(size=(4000, 2)) * scale, np.full((4000, 2), np.nan)])
+    assert spreads(true, sigma, prior)[-1] == pytest.approx(spread, rel=0.1)
+
+
+def test_a_cap_that_leans_among_upright_ones_is_let_go() -> None:
+    true = np.zeros((501, 2))
+    true[-1] = 0.3, 0.4
+    out = spreads(true, 1e-4, 0.4)
+    # of t with 4 degrees of freedom: (4 + tilt^2 / spread^2) / (4 + 2) times the variance
+    assert out[:-1] == pytest.approx(np.full(500, NARROWEST * np.sqrt(4 / 6)), rel=0.01)
+    assert out[-1] == pytest.approx(np.sqrt((4 * NARROWEST**2 + 0.25) / 6), rel=0.01)
+
+
+def test_where_all_stand_upright_the_tilt_of_one_is_better_known_than_where_all_lean() -> None:
+    small, sigmas = Camera(160, 120, 200, 200, 79.5, 59.5), []
+    places = [(x, y) for x in (-0.08, 0.0, 0.08) for y in (-0.04, 0.04)]
+    for tilt in (0, 25):
+        caps = [cap(tilt, 60 * k, (*place, 0.4), 0.02, 0.6) for k, place in enumerate(places)]
+        depth, gray = draw(caps, 0.44, small)
+        depth += np.random.default_rng(0).normal(0, 0.002, depth.shape)
+        stage = CapFit(up="camera", edge_offset_px=0, depth_noise_mm=2, depth_noise_per_m=0)
+        poses = stage.process(frame_from(depth, gray, small), circles_of(caps, small))[1]
+        sigmas.append(np.median(poses.sigma_rad))
+    assert sigmas[0] < 0.8 * sigmas[1]
 
 
 def test_the_variance_of_the_aspect_is_that_of_the_inverse() -> None:
