@@ -213,6 +213,7 @@ def fill_up(rays: Singles, count: int) -> int:
     padded = (count + LANES - 1) // LANES * LANES
     for j in range(count, padded):
         rays[:, j] = 0.0
+        rays[2, j], rays[4, j] = 1.0, 1.0
     return padded
 
 
