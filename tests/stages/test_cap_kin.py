@@ -11,7 +11,18 @@ from hypothesis import strategies as st
 
 from mushpipe import Circles, RgbdFrame
 from mushpipe.core.types import Header
-from mushpipe.stages.cap.kin import DARK, FEWEST, MOST, SURE, USUAL, kin_of, sure_of, unlike
+from mushpipe.stages.cap.kin import (
+    DARK,
+    FEWEST,
+    MOST,
+    SURE,
+    USUAL,
+    alike,
+    kin_of,
+    sure_of,
+    tones_of,
+    unlike,
+)
 from mushpipe.stages.cap_fit import CapFit
 
 HEIGHT, WIDTH, RADIUS = 240, 320, 9.0
@@ -115,6 +126,23 @@ def test_it_is_the_difference_in_units_of_the_usual_one(count: int, shade: float
     expected = np.sqrt(np.mean((np.array([(r + g + b) / 3, r - g, b - g]) / USUAL) ** 2))
     assert found[-1] == pytest.approx(min(expected, MOST), abs=1e-6)
     assert found[:-1] == pytest.approx(0, abs=1e-6)
+
+
+def test_a_tone_is_brightness_and_red_and_blue_over_green() -> None:
+    circles = circles_of(2)
+    tones = np.array([[200.0, 100, 50], [30.0, 60, 90]])
+    red, green, blue = np.log(tones + DARK).T
+    expected = np.column_stack([(red + green + blue) / 3, red - green, blue - green])
+    found = tones_of(bed(circles, tones), circles)
+    assert found == pytest.approx(expected / (USUAL * np.sqrt(3)))
+
+
+def test_the_sure_ones_within_reach_of_each_are_counted_without_itself() -> None:
+    tones = np.random.default_rng(0).normal(size=(30, 3))
+    sure = np.arange(0, 30, 2)
+    apart = np.linalg.norm(tones[:, None] - tones[sure], axis=2)
+    apart[sure, np.arange(len(sure))] = np.inf
+    assert alike(tones, sure, 1.5).tolist() == (apart <= 1.5).sum(axis=1).tolist()
 
 
 def test_too_few_sure_caps_tell_nothing_and_circles_beyond_the_image_do_no_harm() -> None:

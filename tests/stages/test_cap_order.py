@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mushpipe.stages.cap.order import by_depth, paint
+from mushpipe.stages.cap.order import by_depth, core_depth, paint
 
 HEIGHT, WIDTH = 40, 60
 PLACES = st.floats(-80, 120) | st.sampled_from([-1e9, -34980.0, 35020.0, 1e9])
@@ -40,3 +40,22 @@ def test_a_circle_without_depth_hides_nothing(far: int) -> None:
     assert rank.tolist() == ([1, 0] if far == 0 else [0, 1])
     assert ranks[20, 28] == 0  # both cover it, the nearer one has it
     assert ranks[0, 0] == 2
+
+
+@given(st.integers(0, 99), st.floats(-5, 65), st.floats(-5, 45), st.floats(3, 30))
+def test_the_depth_of_a_circle_is_the_median_of_what_is_seen_near_its_centre(
+    seed: int, x: float, y: float, radius: float
+) -> None:
+    # places between pixels: rounding does not decide which
+    x, y, radius = round(x, 1) + 0.037, round(y, 1) + 0.037, round(radius, 1)
+    rng = np.random.default_rng(seed)
+    depth = rng.uniform(0.4, 0.6, (HEIGHT, WIDTH)).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.2] = 0
+    depth[rng.random(depth.shape) < 0.2] = np.nan
+    steps = 0.24 * radius * np.arange(-2, 3)
+    columns, rows = (np.floor(at + steps + 0.5).astype(int) for at in (x, y))
+    places = [(u, v) for u in columns for v in rows]
+    inside = [depth[v, u] for u, v in places if 0 <= u < WIDTH and 0 <= v < HEIGHT]
+    valid = [z for z in inside if z > 0]
+    found = core_depth(depth, np.array([x, y, radius]), np.empty(25, np.float32))
+    assert found == pytest.approx(np.median(valid) if valid else 0.0)
