@@ -46,14 +46,15 @@ def test_a_circle_without_depth_hides_nothing(far: int) -> None:
 def test_the_depth_of_a_circle_is_the_median_of_what_is_seen_near_its_centre(
     seed: int, x: float, y: float, radius: float
 ) -> None:
+    # places between pixels: rounding does not decide which
+    x, y, radius = round(x, 1) + 0.037, round(y, 1) + 0.037, round(radius, 1)
     rng = np.random.default_rng(seed)
     depth = rng.uniform(0.4, 0.6, (HEIGHT, WIDTH)).astype(np.float32)
     depth[rng.random(depth.shape) < 0.2] = 0
     depth[rng.random(depth.shape) < 0.2] = np.nan
     steps = 0.24 * radius * np.arange(-2, 3)
-    places = [
-        (int(np.floor(x + a + 0.5)), int(np.floor(y + b + 0.5))) for a in steps for b in steps
-    ]
+    columns, rows = (np.floor(at + steps + 0.5).astype(int) for at in (x, y))
+    places = [(u, v) for u in columns for v in rows]
     inside = [depth[v, u] for u, v in places if 0 <= u < WIDTH and 0 <= v < HEIGHT]
     valid = [z for z in inside if z > 0]
     found = core_depth(depth, np.array([x, y, radius]), np.empty(25, np.float32))
