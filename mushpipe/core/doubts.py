@@ -109,14 +109,14 @@ def doubts(depth: NDArray[Any]) -> Iterator[str]:
         )
 
 
-def doubts_of_view(depth: NDArray[Any], camera: Camera | None) -> Iterator[str]:
+def doubts_of_view(depth: NDArray[Any], camera: Camera) -> Iterator[str]:
     """Yield why no caps can be seen at depths (N,), m, none of them missing, and what to do.
 
     A unit that is wrong by a factor of eight leaves depths that some camera could have measured,
     but not of caps.
     """
     middle = float(np.median(depth)) if len(depth) else 0.0
-    if camera is None or not NEAREST_M <= middle <= FARTHEST_M:
+    if not NEAREST_M <= middle <= FARTHEST_M:
         return
     if camera.height < 2 * CAP_PX:  # of a test, say: a cap is too small or too large in any case
         return

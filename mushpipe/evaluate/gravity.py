@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 
 from mushpipe.core.arrays import Floats, Singles
-from mushpipe.core.errors import InputError, UsageError, suggest
-from mushpipe.core.recording import GARBAGE, RecordingReader
+from mushpipe.core.errors import InputError, UsageError
+from mushpipe.core.recording import GARBAGE, Raw, RecordingReader
 from mushpipe.sources.decoding import Decoder
 from mushpipe.sources.mcap import McapSource
+from mushpipe.sources.topics import topic_fault
 from mushpipe.stages.upright import bed_normal, pixel_rays
 
 logger = logging.getLogger("mushpipe")
@@ -51,9 +52,9 @@ class Upright:
     def fragment(self) -> str:
         """Return what the setting `up` of a stage takes, with what it was found on, as YAML."""
         x, y, z = (round(float(part), 4) + 0.0 for part in self.up)  # 0.0 for -0.0
-        bed = "" if self.beside_bed_deg is None else (
-            f", {self.beside_bed_deg:.1f} degrees from the bed's normal"
-        )  # fmt: skip
+        bed = ""
+        if self.beside_bed_deg is not None:
+            bed = f", {self.beside_bed_deg:.1f} degrees from the bed's normal"
         return (
             f"# {self.count} readings of {self.topic}, along the axes of '{self.frame_id}': "
             f"{self.strength:.2f} m/s^2, swaying by {self.sway_deg:.1f} degrees{bed}\n"
@@ -121,12 +122,8 @@ def _only(path: Path, reader: RecordingReader) -> str:
 
 def _readings(reader: RecordingReader, topic: str) -> Iterator[tuple[str, tuple[float, ...]]]:
     """Yield the frame and the acceleration, m/s^2, of each message."""
-    index = reader.index()
-    if topic not in index.channels:
-        hint = suggest(topic, sorted(index.channels))
-        raise UsageError(f"{reader.path}: there is no topic '{topic}'; {hint}")
-    if (found := index.schema_name(topic)) != IMU:
-        raise UsageError(f"{reader.path}: topic '{topic}' holds {found}, expected {IMU}")
+    if fault := topic_fault(reader.index(), topic, {IMU}):
+        raise UsageError(f"{reader.path}: {fault}")
     decoder = Decoder()
     for raw in reader.messages({topic}):
         message = _decoded(decoder, raw, reader.path)
@@ -134,7 +131,7 @@ def _readings(reader: RecordingReader, topic: str) -> Iterator[tuple[str, tuple[
         yield message.header.frame_id, (read.x, read.y, read.z)
 
 
-def _decoded(decoder: Decoder, raw: Any, path: Path) -> Any:
+def _decoded(decoder: Decoder, raw: Raw, path: Path) -> Any:
     try:
         return decoder.decode(raw)
     except GARBAGE as error:

@@ -55,8 +55,8 @@ def choose_topics(
             is not there or holds something else.
     """
     for wanted, kinds in ((color, IMAGES), (depth, IMAGES), (camera, CALIBRATIONS)):
-        if wanted is not None:
-            _check_named(index, path, wanted, kinds)
+        if wanted is not None and (fault := topic_fault(index, wanted, kinds)):
+            raise InputError(f"{path}: {fault}")
     images = images_of(index)
     color = color or _one(path, "color", _colors([t for t in images if t != depth]))
     if color is None:
@@ -88,14 +88,13 @@ def _of_others(index: Index) -> str:
     return f"; {', '.join(odd)}, expected {' or '.join(sorted(IMAGES))}" if odd else ""
 
 
-def _check_named(index: Index, path: Path, topic: str, kinds: set[str]) -> None:
+def topic_fault(index: Index, topic: str, kinds: set[str]) -> str:
+    """Return why a topic that somebody names is none of some schemas, empty where it is."""
     if topic not in index.channels:
-        hint = suggest(topic, sorted(index.channels))
-        raise InputError(f"{path}: there is no topic '{topic}'; {hint}")
+        return f"there is no topic '{topic}'; {suggest(topic, sorted(index.channels))}"
     schema = index.schema_name(topic) or "messages without a schema"
-    if schema not in kinds:
-        expected = " or ".join(sorted(kinds))
-        raise InputError(f"{path}: topic '{topic}' holds {schema}, expected {expected}")
+    expected = " or ".join(sorted(kinds))
+    return "" if schema in kinds else f"topic '{topic}' holds {schema}, expected {expected}"
 
 
 def _topics(index: Index, schemas: set[str]) -> list[str]:

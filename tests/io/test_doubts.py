@@ -74,6 +74,7 @@ def test_simulated_depth_is_not_doubted(path: Path) -> None:
 
 def every_doubt(frame: RgbdFrame, scale: float = 1) -> list[str]:
     depth = scale * frame.depth_m[np.isfinite(frame.depth_m)]
+    assert frame.camera is not None
     view, points = doubts_of_view(depth, frame.camera), doubts_of_points(points_of(frame, scale))
     return [*doubts(depth), *view, *points, *doubts_of_camera(frame.camera)]
 
