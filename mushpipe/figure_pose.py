@@ -66,8 +66,7 @@ def draw_pose(alignments: list[tuple[str, Alignment]]) -> Figure:
     panels = figure.subplots(2, n, subplot_kw={"projection": "3d"}, squeeze=False)
     for column, (name, alignment) in enumerate(alignments):
         clouds = (alignment.before, alignment.after)
-        middle = alignment.sample.mean(axis=0)
-        reach = 1e3 * max(np.abs(cloud - middle).max() for cloud in clouds)
+        middle, reach = alignment.middle, 1e3 * alignment.reach
         for row, (model, when) in enumerate(zip(clouds, ("before", "after"), strict=True)):
             axes = panels[row, column]
             for cloud, color, size, alpha in (

@@ -47,7 +47,7 @@ def write_clouds(path: Path, alignments: list[tuple[str, Alignment]]) -> None:
 def _log(recording: Any, name: str, alignment: Alignment) -> None:
     import rerun as rr
 
-    reach = _reach(alignment)
+    reach = alignment.reach
     for part, color in (("sample", BLUE), ("before", RED), ("after", RED)):
         points = rr.Points3D(getattr(alignment, part), colors=color, radii=0.015 * reach)
         recording.log([name, part], points, static=True)
@@ -60,7 +60,7 @@ def _view(name: str, alignment: Alignment, when: str) -> Any:
     import rerun as rr
     import rerun.blueprint as rrb
 
-    middle = alignment.sample.mean(axis=0)
+    middle = alignment.middle
     parts = ["sample", when] + ["axis"] * (when == "after")
     # z of the optical frame points down, onto the bed
     return rrb.Spatial3DView(
@@ -68,16 +68,9 @@ def _view(name: str, alignment: Alignment, when: str) -> Any:
         name=f"{name}, {when}",
         contents=[rr.new_entity_path([name, part]) for part in parts],
         eye_controls=rrb.EyeControls3D(
-            position=middle + 2 * _reach(alignment) * np.array([0.0, 0.8, -0.6]),
+            position=middle + 2 * alignment.reach * np.array([0.0, 0.8, -0.6]),
             look_target=middle,
             eye_up=(0.0, 0.0, -1.0),
         ),
         line_grid=False,
     )
-
-
-def _reach(alignment: Alignment) -> float:
-    """Return how far the clouds reach from the middle of the sample, m."""
-    middle = alignment.sample.mean(axis=0)
-    both = np.concatenate([alignment.before, alignment.after])
-    return float(np.abs(both - middle).max())

@@ -49,6 +49,16 @@ class Alignment:
     before: Floats
     after: Floats
 
+    @property
+    def middle(self) -> Floats:
+        """Middle (3,) of the sample, m."""
+        return np.asarray(self.sample.mean(axis=0))
+
+    @property
+    def reach(self) -> float:
+        """How far the model lies from there along x, y or z at most, before or after, m."""
+        return float(np.abs(np.concatenate([self.before, self.after]) - self.middle).max())
+
 
 class Registration(Stage):
     """Registers the cloud of an upright mushroom to each mushroom's depth, with Open3D.
