@@ -15,7 +15,8 @@ COMPILE := $(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true  # some are 
 demo: $(STAMP)
 	@$(MAKE) --silent kernels-pose & $(BIN)/mushpipe run graphs/demo.yaml; code=$$?; wait; exit $$code
 
-test: $(STAMP)-dev system-libraries
+test:
+	$(MAKE) --jobs 2 $(STAMP)-dev system-libraries
 	$(MAKE) --jobs 2 lint docs types kernels-pose kernels-others
 	$(MAKE) unit
 
@@ -38,8 +39,9 @@ $(STAMP)-dev: $(VENV)/bin/python pyproject.toml
 	@touch $@ $(STAMP)
 
 # open3d needs libGL and libEGL; the tests that use it say so and are skipped without them.
+# After the virtual environment, which may need apt-get as well.
 .PHONY: system-libraries
-system-libraries:
+system-libraries: | $(VENV)/bin/python
 	@ldconfig -p | grep -q libEGL.so.1 && ldconfig -p | grep -q 'libGL.so.1' || { \
 	  if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
 	    apt-get update -qq && apt-get install -y -qq libegl1 libgl1 libusb-1.0-0 >/dev/null; \
@@ -67,9 +69,10 @@ kernels-pose: $(STAMP)
 kernels-others: $(STAMP)-dev
 	$(BIN)/mushpipe run graphs/classic.yaml --set pose.use=surface-fit
 
-# On two cores in three fifths of the time. Fixtures of a file are made once: a file stays on one core.
+# On two cores in three fifths of the time. Each takes half of the files, since fixtures of a file are
+# made once for a core; whichever is done first takes half of what the other still has.
 unit: $(STAMP)-dev
-	$(BIN)/pytest -m 'not slow' --numprocesses auto --maxprocesses 2 --dist loadfile
+	$(BIN)/pytest -m 'not slow' --numprocesses auto --maxprocesses 2 --dist worksteal
 
 test-slow: $(STAMP)-dev system-libraries
 	$(BIN)/pytest -m slow

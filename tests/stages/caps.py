@@ -57,27 +57,39 @@ def half_depth(rays: np.ndarray, c: Cap, half_axis: float, upper: bool) -> np.nd
     return depth
 
 
+def passing(rays: np.ndarray, c: Cap, reach: float) -> np.ndarray:
+    """Which rays (H, W, 3) pass within reach of a cap's centre."""
+    squares = np.einsum("...k,...k", rays, rays)
+    return c.center @ c.center - (rays @ c.center) ** 2 / squares < 1.01 * reach**2
+
+
+def depth_of(
+    caps: list[Cap], bed: float, camera: Camera = CAMERA, du: float = 0.0, dv: float = 0.0
+) -> np.ndarray:
+    """Depth (H, W) m over a bed at z = bed, of rays so many pixels beside the centres of pixels."""
+    v, u = np.mgrid[: camera.height, : camera.width].astype(float)
+    rays = camera.deproject(np.stack([u + du, v + dv], axis=-1), np.ones(u.shape))
+    z = np.full(u.shape, bed)
+    for c in caps:
+        near = passing(rays, c, max(c.radius, c.height))
+        for half_axis, upper in ((c.height, True), (LIP * c.radius, False)):
+            z[near] = np.minimum(z[near], half_depth(rays[near], c, half_axis, upper))
+    return z
+
+
 def draw(caps: list[Cap], bed: float, camera: Camera = CAMERA) -> tuple[np.ndarray, np.ndarray]:
     """Depth (H, W) m over a bed at z = bed, and luma: caps 0.8, bed 0.2, anti-aliased."""
-    depth, color = [], np.zeros((camera.height, camera.width))
-    for dv, du in [(0.0, 0.0), (-0.25, -0.25), (-0.25, 0.25), (0.25, -0.25), (0.25, 0.25)]:
-        v, u = np.mgrid[: camera.height, : camera.width].astype(float)
-        pixels = np.stack([u + du, v + dv], axis=-1)
-        rays = camera.deproject(pixels, np.ones(u.shape))
-        z = np.full(u.shape, bed)
-        for c in caps:
-            z = np.minimum(z, half_depth(rays, c, c.height, True))
-            z = np.minimum(z, half_depth(rays, c, LIP * c.radius, False))
-        depth.append(z)
-        if du:
-            color += np.where(z < bed, 0.8, 0.2) / 4
-    return depth[0], color
+    corners = [(u, v) for u in (-0.25, 0.25) for v in (-0.25, 0.25)]
+    seen = [depth_of(caps, bed, camera, *corner) < bed for corner in corners]
+    return depth_of(caps, bed, camera), 0.2 + 0.6 * np.mean(seen, axis=0)
 
 
 def draw_pointed(c: Cap, power: float, bed: float) -> tuple[np.ndarray, np.ndarray]:
     """Depth and luma of a cap (rho/R)^power + (s/h)^power = 1 over its rim, by bisection."""
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width].astype(float)
     rays = CAMERA.deproject(np.stack([u, v], axis=-1), np.ones(u.shape))
+    near = passing(rays, c, np.hypot(c.radius, c.height))
+    rays = rays[near]
 
     def inside(z: np.ndarray) -> np.ndarray:
         q = rays * z[..., None] - c.center
@@ -88,17 +100,19 @@ def draw_pointed(c: Cap, power: float, bed: float) -> tuple[np.ndarray, np.ndarr
         return rho**bend + high**bend < 1
 
     steps = np.linspace(c.center[2] - 2 * c.radius, c.center[2] + 2 * c.radius, 200)
-    deep = np.full(u.shape, np.inf)
+    deep = np.full(len(rays), np.inf)
     for z in steps:
-        deep = np.where(np.isinf(deep) & inside(np.full(u.shape, z)), z, deep)
+        deep = np.where(np.isinf(deep) & inside(np.full(len(rays), z)), z, deep)
     hit = np.isfinite(deep)
     deep = np.where(hit, deep, bed)
-    near = deep - (steps[1] - steps[0])
+    before = deep - (steps[1] - steps[0])
     for _ in range(14):
-        middle = (near + deep) / 2
+        middle = (before + deep) / 2
         within = inside(middle)
-        near, deep = np.where(within, near, middle), np.where(within, middle, deep)
-    return np.where(hit, deep, bed), np.where(hit, 0.8, 0.2)
+        before, deep = np.where(within, before, middle), np.where(within, middle, deep)
+    depth, luma = np.full(u.shape, bed), np.full(u.shape, 0.2)
+    depth[near], luma[near] = np.where(hit, deep, bed), np.where(hit, 0.8, 0.2)
+    return depth, luma
 
 
 def frame_from(depth: np.ndarray, gray: np.ndarray, camera: Camera | None = CAMERA) -> RgbdFrame:
@@ -120,7 +134,7 @@ def image_of(depth: np.ndarray, camera: Camera = CAMERA) -> Image:
 
 def circle_of(c: Cap, camera: Camera = CAMERA) -> tuple[float, float, float]:
     """Centroid and equal-area radius of the outline of a cap that nothing hides."""
-    return circle_around(draw([c], 10.0, camera)[0] < 10.0)
+    return circle_around(depth_of([c], 10.0, camera) < 10.0)
 
 
 def circle_around(shape: np.ndarray) -> tuple[float, float, float]:
