@@ -10,6 +10,7 @@ MODULE MushroomPicker
     CONST num VALID_S := 0.5;   ! from the image to the moment of setting off
     VAR socketdev vision;
     VAR string picked := "";   ! what the server has not been told yet
+    VAR num newest := 0;       ! number of its newest result when that was accepted
 
     PROC main()
         Connect;
@@ -35,9 +36,12 @@ MODULE MushroomPicker
             TPWrite "vision: " + answer;
             Stop;
         ENDIF
-        ! Under the same name this robot still holds what it had accepted.
+        ! Under the same name this robot still holds what it had accepted. A smaller number than then
+        ! says that the server was restarted: that id is another mushroom's now.
         IF picked <> "" THEN
-            answer := Ask("ACK," + picked + ",DONE");
+            IF NewestResult() >= newest THEN
+                answer := Ask("ACK," + picked + ",DONE");
+            ENDIF
             picked := "";
         ENDIF
     ENDPROC
@@ -70,6 +74,16 @@ MODULE MushroomPicker
             RAISE ERR_ARGVALERR;
         ENDIF
         RETURN value;
+    ENDFUNC
+
+    ! The number in S,RUNNING,42,LIVE.
+    FUNC num NewestResult()
+        VAR string line;
+        VAR string word;
+        line := Ask("STATE");
+        word := Field(line);
+        word := Field(line);
+        RETURN Number(line);
     ENDFUNC
 
     PROC PickOne()
@@ -108,6 +122,7 @@ MODULE MushroomPicker
         IF line <> "A," + id + ",REMOVED" THEN
             RETURN;
         ENDIF
+        newest := NewestResult();
         ! Asked, answered and accepted: all of that took time, and a paused program takes more.
         IF age / 1000 + ClkRead(asked) > VALID_S THEN
             line := Ask("ACK," + id + ",REJECTED");

@@ -25,11 +25,13 @@ _SCALARS = {"null", "bool", "int", "float", "str", "timestamp"}
 
 
 class _Loader(yaml.SafeLoader):
-    """Reads 1e-3 as a number, as YAML 1.2 and people do; YAML 1.1 wants 1.0e-3."""
+    """Reads 1e-3 and -.1 as numbers, as YAML 1.2 and people do; YAML 1.1 wants 1.0e-3 and -0.1."""
 
 
 _Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+$"), list("-+0123456789")
+    "tag:yaml.org,2002:float",
+    re.compile(r"[-+]?(\d+(\.\d*)?[eE][-+]?\d+|\.\d+([eE][-+]?\d+)?)$"),
+    list("-+.0123456789"),
 )
 
 

@@ -17,6 +17,7 @@ from mushpipe.core.errors import MushpipeError, StageError
 from mushpipe.core.mailbox import Mailbox
 from mushpipe.core.plan import Node
 from mushpipe.core.plugins import prints_aside
+from mushpipe.core.recorder import RecordingError
 from mushpipe.core.report import Durations, SinkReport
 from mushpipe.core.stage import Plugin, ReplaySource, RunInfo, Sink, Source, Stage
 from mushpipe.core.types import RgbdFrame
@@ -197,7 +198,10 @@ class SourceThread(threading.Thread):
 
 
 class SinkThread(threading.Thread):
-    """Feeds one sink in order; with ``tolerant`` a failing frame is counted and the next tried."""
+    """Feeds one sink in order; with ``tolerant`` a failing frame is counted and the next tried.
+
+    Not where a recording cannot be written: nothing that follows could be read.
+    """
 
     def __init__(self, node: Node, latest: bool, tolerant: int, durations: Durations) -> None:
         super().__init__(name=f"mushpipe-{node.name}", daemon=True)
@@ -227,7 +231,7 @@ class SinkThread(threading.Thread):
                 self.failed += 1
                 in_a_row += 1
                 last = failure(self.node, frame.header.sequence, error)
-                if in_a_row >= self.tolerant:
+                if in_a_row >= self.tolerant or isinstance(error, RecordingError):
                     self.error = last
                     if not isinstance(error, MushpipeError):  # not a full disk, for instance
                         self.failed_frame = frame

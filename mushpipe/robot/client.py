@@ -61,7 +61,13 @@ class RobotClient:
 
     def _greet(self, **hello: Any) -> Message:
         """Return the server's hello, after it has taken ours."""
-        first = self.receive()
+        try:
+            first = self.receive()
+        except TimeoutError:
+            raise TimeoutError(
+                f"no hello within {self._socket.gettimeout():g} s: is this the port for ABB, which "
+                "waits to be spoken to, or does the server stand still?"
+            ) from None
         if first["op"] == "hello" and not str(first.get("version")).startswith("1."):
             raise PermissionError(
                 f"the server speaks version {first.get('version')}, this client 1.0"

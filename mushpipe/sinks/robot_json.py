@@ -212,16 +212,17 @@ class RobotJsonSink(Sink):
         choice, taken = self._filter(picks), self._taken(trace)
         self._server.hub.publish(choice, header.sequence, header.stamp_ns, taken)
         self._server.wake()
-        self._watch(1000 * (self._clock.monotonic() - taken))
+        self._watch(1000 * (self._clock.monotonic() - taken), 1000 * _spent_s(trace))
 
-    def _watch(self, age_ms: float) -> None:
+    def _watch(self, age_ms: float, spent_ms: float) -> None:
         """Say it, once, where results are regularly too old to be sent."""
         self._late = self._late + 1 if self.max_age_ms < age_ms < inf else 0
         if self._late == LATE:
             self._warn(
-                f"results are {age_ms:.0f} ms old when they come, and 'max_age_ms' is "
-                f"{self.max_age_ms:g}: robots get nothing; the stages are too slow, or the "
-                "camera's time stamps run behind"
+                "results are %.0f ms old when they come, %.0f ms of it since they left the source, "
+                "and 'max_age_ms' is %g: robots get nothing; the stages are too slow, or frames "
+                "come late (a slow link), or a clock was set or runs behind",
+                *(age_ms, spent_ms, self.max_age_ms),
             )
 
     def _taken(self, trace: Trace) -> float:
@@ -229,9 +230,7 @@ class RobotJsonSink(Sink):
 
         Of a recording only the time since it was played can be told, and that is its age.
         """
-        header, played = trace.frame.header, self._clock.monotonic()
-        if trace.left_ns is not None:
-            played -= (time.perf_counter_ns() - trace.left_ns) / 1e9
+        header, played = trace.frame.header, self._clock.monotonic() - _spent_s(trace)
         if not self._live or self._placer is None:
             return played
         sensor = clock_of(trace.frame)
@@ -249,10 +248,11 @@ class RobotJsonSink(Sink):
             self._warn("frames come later than the quickest did, by more than 'max_age_ms'")
         return min(placed, played) - self.sensor_latency_ms / 1000
 
-    def _warn(self, text: str) -> None:
+    def _warn(self, text: str, *numbers: float) -> None:
+        """Say it once, whatever the numbers."""
         if text not in self._warned:
             self._warned.add(text)
-            logger.warning("%s", text)
+            logger.warning(text, *numbers)
 
     def finish(self, summary: Mapping[str, Any]) -> None:
         """Note how the run ended, for the robots' last word."""
@@ -272,6 +272,11 @@ class RobotJsonSink(Sink):
         if self._transcript is not None:
             self._transcript.close()
             self._transcript = None
+
+
+def _spent_s(trace: Trace) -> float:
+    """Return the time since a frame left its source, s; 0 where that is not known."""
+    return 0.0 if trace.left_ns is None else (time.perf_counter_ns() - trace.left_ns) / 1e9
 
 
 def _is_of_host(header: Header, sensor: SensorClock | None) -> bool:

@@ -8,6 +8,7 @@ import pytest
 
 from mushpipe import Circles, InputError, RgbdFrame, Sink, Source, Stage
 from mushpipe.core.errors import EXIT_DAMAGED
+from mushpipe.core.recorder import RecordingError
 from tests.core.lab import Lab, held, make_frame, soon
 
 FULL = OSError("disk full")
@@ -140,6 +141,15 @@ def test_a_skipping_run_forgives_a_sink(lab: Lab, caplog):
     assert vars(report.sinks["out"]) == {"handed": 6, "consumed": 3, "dropped": 0, "failed": 3}
     assert report.exit_code == 0
     assert "failed on frame 4: OSError: disk full; the sink goes on" in caplog.text
+
+
+def test_a_file_that_takes_no_more_ends_a_skipping_run_at_once(lab: Lab, caplog):
+    sink = failing_sink(lab, 1, error=RecordingError("no space left"))
+    report = lab.run(sink + SKIP, "source.count=1000")
+    assert report.sinks["out"].failed == 1
+    assert report.balanced()
+    assert str(report.error) == "sink 'out' (picky) failed on frame 1: no space left"
+    assert "goes on" not in caplog.text
 
 
 def test_a_sink_that_took_nothing_has_failed(lab: Lab):

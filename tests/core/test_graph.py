@@ -1,5 +1,6 @@
 """Compiling graph files: what a plan holds, and the words for every kind of fault."""
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -634,3 +635,9 @@ def test_a_fault_at_the_top_does_not_hide_the_faults_below() -> None:
 def test_numbers_may_be_written_as_powers_of_ten() -> None:
     data = parse_document("a: 1e-3\nb: -2E+4\nc: 1.5e3\nd: 1e\n", "g.yaml", Path()).data
     assert data == {"a": 1e-3, "b": -2e4, "c": 1.5e3, "d": "1e"}
+
+
+def test_numbers_may_begin_with_their_point() -> None:
+    text = "a: [-.1, +.5, .2, -.5e-1, .5E2, -.inf]\nb: [.e, -., .1e, -.1.2]\n"
+    data = parse_document(text, "g.yaml", Path()).data
+    assert data == {"a": [-0.1, 0.5, 0.2, -0.05, 50, -math.inf], "b": [".e", "-.", ".1e", "-.1.2"]}

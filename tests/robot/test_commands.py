@@ -217,6 +217,11 @@ def test_another_program_on_the_port_is_named() -> None:
             RobotClient(port=other.getsockname()[1])
 
 
+def test_a_port_for_abb_is_named() -> None:
+    with bench() as b, pytest.raises(TimeoutError, match=r"no hello within 0\.05 s.* ABB"):
+        RobotClient(port=b.server.ports[1], timeout_s=0.05)
+
+
 @pytest.mark.parametrize("written", ["[::1]:{}", "::1:{}"])
 def test_an_address_may_be_of_ipv6(monkeypatch: pytest.MonkeyPatch, written: str) -> None:
     def give_up(_: float) -> None:

@@ -370,8 +370,23 @@ def test_a_chain_that_is_too_slow_says_why_robots_get_nothing(
     for _ in range(5):
         clock.now += 1
         consume(sink, clock.wall_ns() - 7 * 10**8, clock.wall_ns(), 0.7)
-    assert "results are 700 ms old when they come, and 'max_age_ms' is 500" in caplog.text
+    told = "results are 700 ms old when they come, 700 ms of it since they left the source"
+    assert f"{told}, and 'max_age_ms' is 500" in caplog.text
+    for spent in (0.1,) + (0.8,) * 10:  # the same trouble again
+        clock.now += 1
+        consume(sink, clock.wall_ns() - round(spent * 1e9), clock.wall_ns(), spent)
     assert caplog.text.count("robots get nothing") == 1
+
+
+def test_frames_that_come_late_are_not_said_to_wait_for_the_stages(
+    sink: RobotJsonSink, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Of a stream over a slow link, say."""
+    clock = live_clock(sink)
+    for _ in range(10):
+        clock.now += 1
+        consume(sink, clock.wall_ns() - 16 * 10**8, clock.wall_ns(), 0.13)
+    assert "1600 ms old when they come, 130 ms of it since they left the source" in caplog.text
 
 
 def test_the_latency_of_the_sensor_is_added() -> None:
