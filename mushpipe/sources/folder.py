@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from mushpipe import Header, InputError, ReplaySource, RgbdFrame, UsageError
-from mushpipe.core.paths import IMAGES, GraphPath, require_listed
+from mushpipe.core.paths import IMAGES, RECORDINGS, GraphPath, require_listed
 from mushpipe.core.types import COLOR_FRAME
 from mushpipe.sources.recorded import NO_CAMERA, NO_DEPTH, Intrinsics
 
 logger = logging.getLogger("mushpipe")
-RECORDINGS = (".mcap", ".db3", ".bag", ".zstd")  # what may stand in a folder that is a ROS 2 bag
 _TO_RGB = cv2.COLOR_BGR2RGB
 ALONE = "%s images without a %s image"
 

@@ -80,10 +80,11 @@ def test_a_file_that_is_not_there_or_a_folder(tmp_path):
     with pytest.raises(UsageError) as caught:
         RecordingReader(tmp_path)
     assert str(caught.value) == f"{tmp_path}: it is a folder, in which no recording is"
-    (tmp_path / "bag_0.mcap").touch()
-    with pytest.raises(UsageError) as caught:
-        RecordingReader(tmp_path)
-    assert str(caught.value).endswith(f"a recording is a file: {tmp_path}/bag_0.mcap")
+    for name in ("bag_0.db3", "bag_0.mcap"):  # what SQLite holds, its own message tells
+        (tmp_path / name).touch()
+        with pytest.raises(UsageError) as caught:
+            RecordingReader(tmp_path)
+        assert str(caught.value).endswith(f"a recording is a file: {tmp_path}/{name}")
 
 
 def records(data: bytes) -> list[tuple[int, int, int]]:
