@@ -51,6 +51,8 @@ _OTHERS = {
     "viewer is played where its name ends with .bag",
     b"RRF": "a Rerun file: open it with 'rerun FILE'",
     ZSTD: "compressed as a whole: 'zstd -d FILE' unpacks it",
+    b"\x1f\x8b": "compressed as a whole: 'gunzip FILE' unpacks it",
+    b"PK\x03\x04": "a zip archive: 'unzip FILE' unpacks it",
     **dict.fromkeys(
         (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"),
         "an image: 'mushpipe record --source IMAGE -o FILE' makes a recording of one or a folder",
