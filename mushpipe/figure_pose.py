@@ -51,8 +51,10 @@ def aligned(
     tries = ((names[row], stage.align(frame, circles, locations, row, 0)) for row in tried)
     found = list(islice(((name, each) for name, each in tries if each is not None), POSES))
     if not found:
-        which = "no mushroom has" if chosen is None else f"{kind} {chosen} has not"
         number = trace.frame.header.sequence
+        if not len(circles):
+            raise UsageError(f"frame {number}: no mushroom was found there; choose another frame")
+        which = "no mushroom has" if chosen is None else f"{kind} {chosen} has not"
         raise UsageError(f"frame {number}: {which} enough depth, or the model ran away")
     return found
 

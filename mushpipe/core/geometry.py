@@ -19,7 +19,8 @@ from mushpipe.core.arrays import Floats
 
 COEFFICIENTS = {"none": 0, "brown_conrady": 5, "inverse_brown_conrady": 5, "rational": 8}
 _FORWARD = ("brown_conrady", "rational")
-_ROUNDS = 60  # of Gauss-Newton, at most
+_ROUNDS = 60  # of Newton's method, at most
+_BLOCK = 16_384  # points at a time: whole images would leave the processor's cache
 
 
 def brown(xy: Floats, coefficients: tuple[float, ...]) -> Floats:
@@ -32,53 +33,93 @@ def brown(xy: Floats, coefficients: tuple[float, ...]) -> Floats:
     Returns:
         (..., 2) distorted coordinates.
     """
-    k1, k2, p1, p2, k3, *below = coefficients
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
+    return np.stack(_lens(x, y, r2, _radial(r2, coefficients)[0], coefficients), axis=-1)
+
+
+def _radial(r2: Floats, coefficients: tuple[float, ...]) -> tuple[Floats, Floats]:
+    """Return the radial factor at r^2, and its derivative by r^2."""
+    k1, k2, _, _, k3, *below = coefficients
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = k1 + r2 * (2 * k2 + r2 * (3 * k3))
     if below:
         k4, k5, k6 = below
-        radial = radial / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    return np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
-        ],
-        axis=-1,
+        under = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        radial = radial / under
+        slope = (slope - radial * (k4 + r2 * (2 * k5 + r2 * (3 * k6)))) / under
+    return radial, slope
+
+
+def _lens(
+    x: Floats, y: Floats, r2: Floats, radial: Floats, coefficients: tuple[float, ...]
+) -> tuple[Floats, Floats]:
+    p1, p2 = coefficients[2:4]
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
     )
 
 
 def brown_inverse(xy: Floats, coefficients: tuple[float, ...]) -> Floats:
-    """Undo `brown` by Gauss-Newton with a numeric Jacobian.
+    """Undo `brown` by Newton's method.
 
     Points where no pre-image is found to 1e-7 become NaN, and so do pre-images beyond the fold of
     the polynomial: a lens model is only valid inside the image it was fitted on, and a wrong ray
     must not pass for a right one.
     """
     wanted = xy.reshape(-1, 2).astype(np.float64)
-    guess, step, fold = wanted.copy(), 1e-6, _fold(coefficients)
+    found = np.empty_like(wanted)
+    for start in range(0, len(wanted), _BLOCK):
+        part = slice(start, start + _BLOCK)
+        found[part] = _block_inverse(wanted[part], coefficients)
+    return found.reshape(xy.shape)
+
+
+def _block_inverse(wanted: Floats, coefficients: tuple[float, ...]) -> Floats:
+    """Undo `brown` for points (N, 2)."""
+    fold = _fold(coefficients)
+    wanted_x, wanted_y = np.ascontiguousarray(wanted.T)
+    x, y = wanted_x.copy(), wanted_y.copy()
     with np.errstate(all="ignore"):
         # A wide lens ends inside the image, and of what lies beyond nothing would converge.
-        left = np.flatnonzero(~(np.hypot(*wanted.T) > _farthest_image(coefficients, fold)))
+        reach = _farthest_image(coefficients, fold)
+        left = np.flatnonzero(~(np.hypot(wanted_x, wanted_y) > reach))
         for _ in range(_ROUNDS):
-            now = guess[left]
-            error = brown(now, coefficients) - wanted[left]
-            going = np.abs(error).max(axis=-1) >= 1e-12
-            left, now, error = left[going], now[going], error[going]
-            if not len(left):
+            u, v = x[left], y[left]
+            r2 = u * u + v * v
+            radial, slope = _radial(r2, coefficients)
+            image_x, image_y = _lens(u, v, r2, radial, coefficients)
+            off = image_x - wanted_x[left], image_y - wanted_y[left]
+            going = np.maximum(np.abs(off[0]), np.abs(off[1])) >= 1e-12
+            if not going.any():
                 break
-            columns = [
-                (brown(now + d, coefficients) - brown(now - d, coefficients)) / (2 * step)
-                for d in step * np.eye(2)
-            ]
-            (a, c), (b, d) = (column.T for column in columns)
-            ex, ey = error.T
-            update = np.column_stack([d * ex - b * ey, a * ey - c * ex])
-            guess[left] = now - update / (a * d - b * c)[:, None]
+            dx, dy = _newton(u, v, radial, slope, off, coefficients)
+            left = left[going]
+            x[left] -= dx[going]
+            y[left] -= dy[going]
+        guess = np.column_stack([x, y])
         bad = ~(np.abs(brown(guess, coefficients) - wanted).max(axis=-1) < 1e-7)
         bad |= (guess**2).sum(axis=-1) >= fold
     guess[bad] = np.nan
-    return guess.reshape(xy.shape)
+    return guess
+
+
+def _newton(
+    x: Floats,
+    y: Floats,
+    radial: Floats,
+    slope: Floats,
+    off: tuple[Floats, Floats],
+    coefficients: tuple[float, ...],
+) -> tuple[Floats, Floats]:
+    """Return what to take off x and y, whose images are off by so much."""
+    p1, p2 = coefficients[2:4]
+    xx = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+    yy = radial + 2 * y * y * slope + 2 * p2 * x + 6 * p1 * y
+    xy = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y  # of x by y, and of y by x
+    det = xx * yy - xy * xy
+    return (yy * off[0] - xy * off[1]) / det, (xx * off[1] - xy * off[0]) / det
 
 
 def _farthest_image(coefficients: tuple[float, ...], fold: float) -> float:

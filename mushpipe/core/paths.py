@@ -19,6 +19,8 @@ STDIO = Path("-")
 """In place of a file: standard output."""
 IMAGES = frozenset([".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm"])
 """How names of images end, in lower case."""
+RECORDINGS = (".mcap", ".db3", ".bag", ".zstd")
+"""How names of recordings end, in lower case, those first that are read as they are."""
 
 
 def from_home(path: str | Path) -> Path:
@@ -30,6 +32,13 @@ def from_home(path: str | Path) -> Path:
     with suppress(RuntimeError):  # of no user is it the home: a file may be called ~x
         return Path(path).expanduser()
     return Path(path)
+
+
+def in_its_place(folder: Path) -> str:
+    """Return what to give in place of a folder, where a recording is asked for."""
+    files = sorted(folder.iterdir())
+    found = [file for kind in RECORDINGS for file in files if file.suffix.lower() == kind]
+    return f"; a recording is a file: {found[0]}" if found else ", in which no recording is"
 
 
 def real(path: Path) -> Path:

@@ -27,6 +27,7 @@ from zstandard import ZstdError
 
 from mushpipe.core.chunks import by_log_time, side_by_side
 from mushpipe.core.errors import InputError, UsageError
+from mushpipe.core.paths import in_its_place
 from mushpipe.core.summary import is_intact, require_complete
 from mushpipe.core.truth import TABLE
 
@@ -50,17 +51,13 @@ _OTHERS = {
     "viewer is played where its name ends with .bag",
     b"RRF": "a Rerun file: open it with 'rerun FILE'",
     ZSTD: "compressed as a whole: 'zstd -d FILE' unpacks it",
+    b"\x1f\x8b": "compressed as a whole: 'gunzip FILE' unpacks it",
+    b"PK\x03\x04": "a zip archive: 'unzip FILE' unpacks it",
     **dict.fromkeys(
         (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"),
         "an image: 'mushpipe record --source IMAGE -o FILE' makes a recording of one or a folder",
     ),
 }
-
-
-def _recordings_in(folder: Path) -> str:
-    """Return what to give in place of a folder."""
-    found = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".mcap")
-    return f"; a recording is a file: {found[0]}" if found else ", in which no recording is"
 
 
 class Raw(NamedTuple):
@@ -130,7 +127,7 @@ class RecordingReader:
                     "file; a graph plays what is piped into 'mushpipe run GRAPH --source -'"
                 )
             if path.is_dir():
-                raise UsageError(f"{path}: it is a folder{_recordings_in(path)}")
+                raise UsageError(f"{path}: it is a folder{in_its_place(path)}")
             with path.open("rb") as file:
                 magic = file.read(len(MAGIC))
         except FileNotFoundError:

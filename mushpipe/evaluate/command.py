@@ -208,6 +208,7 @@ def _judge_graph(
     request: Request, graph: Path, folder: Path, runner: Runner
 ) -> tuple[list[Evaluation], int]:
     recordings = recordings_in([*request.recordings, *(p for p in request.targets if p != graph)])
+    recordings = [*{real(path): path for path in recordings}.values()]  # each counts once
     truths: Sequence[TruthSet | None]
     if recordings and not request.truth:
         recordings = _with_truth(recordings)
@@ -253,7 +254,6 @@ def _judge(
 
 
 def _with_truth(recordings: list[Path]) -> list[Path]:
-    recordings = [*{real(path): path for path in recordings}.values()]  # each counts once
     kept = [path for path in recordings if has_truth(path)]
     for path in recordings:
         if path not in kept:

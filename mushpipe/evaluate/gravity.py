@@ -94,11 +94,11 @@ def measure_up(path: Path, topic: str | None = None) -> Upright:
     sway = float(np.degrees(np.sqrt((np.arctan2(across, values @ up) ** 2).mean())))
     if sway > SWAY_DEG:
         raise InputError(f"{path}: {topic} sways by {sway:.1f} degrees: the camera did not rest")
-    frame_id, beside = read[-1][0], _beside_bed(path, up)
+    frame_id, (beside, unseen) = read[-1][0], _beside_bed(path, up)
     if beside is None and not frame_id.endswith("optical_frame"):
         raise InputError(
-            f"{path}: {topic} is along the axes of '{frame_id}', and there is no depth that would "
-            "show whether these are the camera's (x right, y down, z forward)"
+            f"{path}: {topic} is along the axes of '{frame_id}', and no bed shows whether these "
+            f"are the camera's (x right, y down, z forward): {unseen}"
         )
     if beside is not None and beside > TURNED_DEG:
         raise InputError(
@@ -138,14 +138,18 @@ def _decoded(decoder: Decoder, raw: Raw, path: Path) -> Any:
         raise InputError(f"{path}: {raw.channel.topic} cannot be decoded: {error}") from error
 
 
-def _beside_bed(path: Path, up: Floats) -> float | None:
-    """Return the angle, degrees, between an upright and the bed's normal; None without depth."""
+def _beside_bed(path: Path, up: Floats) -> tuple[float | None, str]:
+    """Return the angle, degrees, between an upright and the bed's normal, or why there is none."""
     try:
         frame = next(iter(McapSource(path=path, max_frames=1).frames()), None)
-    except InputError:  # a recording of the IMU alone
-        return None
-    if frame is None or frame.camera is None:
-        return None
+    except InputError as error:  # a recording of the IMU alone, or one that has to be chosen from
+        return None, str(error).removeprefix(f"{path}: ").split(";")[0]
+    if frame is None or frame.depth is None:
+        return None, "its first frame has no depth"
+    if frame.camera is None:
+        return None, "it has no calibration"
     depth: Singles = np.fmax(frame.depth_m, np.float32(0))
     normal = bed_normal(depth, pixel_rays(frame.camera))
-    return None if normal is None else float(np.degrees(np.arccos(np.clip(normal @ up, -1, 1))))
+    if normal is None:
+        return None, "its first frame has too little depth"
+    return float(np.degrees(np.arccos(np.clip(normal @ up, -1, 1)))), ""

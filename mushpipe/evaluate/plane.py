@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -71,6 +72,25 @@ def _flat_std(window: Floats) -> float:
     return float((depths - design @ solution).std())
 
 
+def _windows(recording: Path) -> Iterator[Floats]:
+    """Yield the central window of each depth image of a recording.
+
+    Raises:
+        InputError: It cannot be played, or its images are too small.
+    """
+    from mushpipe.sources.mcap import McapSource
+
+    try:
+        for frame in McapSource(path=recording).frames():
+            if frame.depth is not None:
+                yield window_of(frame.depth_m)
+    except InputError as error:
+        told = str(error) if str(recording) in str(error) else f"{recording}: {error}"
+        if "_topic=" in told:  # a setting of runs, which nothing here takes
+            told += f" of 'mushpipe record --source {recording} -o NEW.mcap', and measure that one"
+        raise InputError(told) from error
+
+
 def measure_plane(
     recording: Path, distance_m: float, resamples: int = 1000, seed: int = 0
 ) -> PlaneRow:
@@ -80,13 +100,7 @@ def measure_plane(
         InputError: The recording cannot be played, or holds no depth.
         UsageError: The plane is not at that distance.
     """
-    from mushpipe.sources.mcap import McapSource
-
-    frames = [
-        plane_values(window_of(frame.depth_m), distance_m)
-        for frame in McapSource(path=recording).frames()
-        if frame.depth is not None
-    ]
+    frames = [plane_values(window, distance_m) for window in _windows(recording)]
     if not frames:
         raise InputError(f"{recording}: it holds no depth")
     weights = statistics.draw(len(frames), resamples, seed)

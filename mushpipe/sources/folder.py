@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from mushpipe import Header, InputError, ReplaySource, RgbdFrame, UsageError
-from mushpipe.core.paths import IMAGES, GraphPath, require_listed
+from mushpipe.core.paths import IMAGES, RECORDINGS, GraphPath, require_listed
 from mushpipe.core.types import COLOR_FRAME
 from mushpipe.sources.recorded import NO_CAMERA, NO_DEPTH, Intrinsics
 
 logger = logging.getLogger("mushpipe")
-RECORDINGS = (".mcap", ".db3", ".bag", ".zstd")  # what may stand in a folder that is a ROS 2 bag
 _TO_RGB = cv2.COLOR_BGR2RGB
 ALONE = "%s images without a %s image"
 
@@ -207,9 +206,22 @@ def _read(path: Path, how: int) -> NDArray[Any]:
         data = np.frombuffer(path.read_bytes(), np.uint8)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    log = cv2.utils.logging
+    before = log.setLogLevel(log.LOG_LEVEL_SILENT)  # what is wrong with a file is told here
+    try:
+        return _decoded(path, data, how)
+    finally:
+        log.setLogLevel(before)
+
+
+def _decoded(path: Path, data: NDArray[np.uint8], how: int) -> NDArray[Any]:
+    if not len(data):
+        raise InputError(f"{path}: it is empty")
     if cv2.imcount(str(path)) > 1:
         raise InputError(f"{path}: it holds several images: make a file of each")
-    image = cv2.imdecode(data, how) if len(data) else None
-    if image is None:
-        raise InputError(f"{path}: it is no image, or damaged")
+    image = cv2.imdecode(data, how)
+    if image is None:  # depth of floats cannot be had as colour
+        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+        if image is None or image.dtype == np.uint8:
+            raise InputError(f"{path}: it is no image, or damaged")
     return np.asarray(image)

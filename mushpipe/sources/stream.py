@@ -129,13 +129,13 @@ class StreamSource(RecordedSource):
         if topics.depth not in {raw.channel.topic for raw in head}:
             first = replace(topics, depth=None)
             if head:
-                logger.warning(NO_DEPTH, "the stream")
+                logger.warning(NO_DEPTH, f"the stream{self._on(topics.depth, ',')}")
         beside = beside_of(reader.topics, topics) if self._manifest else set()
         player = Player(self, "the stream", first, beside, bool(self._manifest), self._counts)
         known = _of_interest(chain(head, messages), player, topics)
         for frame in player.play(known, hold=False):
             if frame.camera is None and player.frames == 1:
-                why = f" ({player.error})" if player.error else ""
+                why = f" ({player.error})" if player.error else self._on(topics.camera)
                 logger.warning(NO_CAMERA, "the stream", why)
             yield frame
         if self._interrupted.is_set():
@@ -173,9 +173,16 @@ class StreamSource(RecordedSource):
         more = self._input.peek(1)
         return "goes on behind its end: send one recording at a time" if more else ""
 
+    def _on(self, topic: str | None, comma: str = "") -> str:
+        """Return where something was looked for in what another program sends."""
+        return "" if self._manifest or topic is None else f"{comma} on {topic}{comma}"
+
     def _nothing_on(self, topic: str, reader: _Messages) -> str:
         found = ", ".join(sorted(reader.topics)) or "nothing"
-        return f"the stream has no colour images on {topic}, only {found}"
+        return (
+            f"the stream has no colour images on {topic}, only {found}: where they are among "
+            "these, name source.color_topic, source.depth_topic and source.camera_topic"
+        )
 
 
 def _require_kinds(head: list[Raw], topics: Topics) -> None:

@@ -38,7 +38,7 @@ class UsualSize:
         if not SMALL_M <= usual <= LARGE_M:
             self._told = True
             logger.warning(
-                "frame %d: half of the diameters of %d mushrooms are %s %.0f mm; where caps are of "
+                "frame %d: half of the diameters of %d mushrooms are %s %.3g mm; where caps are of "
                 "another size, positions are as wrong: depth is of another unit "
                 "(source.depth_scale), or the calibration of another camera or size of image",
                 *(number, len(known), "below" if usual < SMALL_M else "above", 1000 * usual),

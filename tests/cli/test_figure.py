@@ -232,6 +232,9 @@ def test_a_mushroom_that_is_not_there_or_has_no_pose_is_named() -> None:
         aligned(trace, {}, 0)
     with pytest.raises(UsageError, match="frame 10: pick 8 has not enough depth"):
         aligned(trace, {"min_points": 10_000}, 8)
+    empty = {"detect": Circles([], [], []), "locate": Locations.unknown(0)}
+    with pytest.raises(UsageError, match="frame 10: no mushroom was found there"):
+        aligned(trace_of(trace.frame, **empty), {})
 
 
 def test_what_is_missing_is_named(tmp_path: Path) -> None:

@@ -1,5 +1,7 @@
 """Camera and rotations against closed forms, OpenCV and SciPy."""
 
+import tracemalloc
+
 import cv2
 import numpy as np
 import pytest
@@ -126,6 +128,21 @@ def test_a_ray_that_the_lens_cannot_have_is_nan():
     radius = found[0, 0]
     assert radius == pytest.approx(min(r.real for r in np.roots([-1, 0, 1, -0.38]) if r.real > 0))
     assert np.isnan(found[1]).all()
+
+
+@pytest.mark.parametrize("camera", [BROWN, RATIONAL], ids=lambda camera: camera.model)
+def test_the_rays_of_a_whole_image_take_little_memory_and_lead_back_to_its_pixels(camera):
+    """Twelve megapixels once took 3 GB."""
+    pixels = np.stack(np.mgrid[:640, :480], axis=-1).astype(float)
+    tracemalloc.start()
+    rays = camera.deproject(pixels, np.ones((640, 480)))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 6 * pixels.nbytes
+    back, _ = cv2.projectPoints(
+        rays.reshape(-1, 3), np.zeros(3), np.zeros(3), MATRIX, np.array(camera.coefficients)
+    )
+    np.testing.assert_allclose(back.reshape(pixels.shape), pixels, atol=1e-6)
 
 
 def test_the_polynomial_by_hand():

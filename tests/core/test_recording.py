@@ -1,5 +1,6 @@
 """The MCAP reader on files of its own and on files that are not what they seem."""
 
+import gzip
 import os
 import struct
 from pathlib import Path
@@ -62,6 +63,11 @@ def test_the_index_is_the_same_from_summary_and_from_reading(tmp_path, options):
         (b"", "the file is empty"),
         (b"MThd\0\0\0\6\0", "not an MCAP file (it begins with b'MThd\\x00\\x00\\x00\\x06')"),
         (MAGIC[:4], "not an MCAP file (it begins with b'\\x89MCA')"),
+        (
+            gzip.compress(MAGIC, mtime=0),
+            "not an MCAP file (it is compressed as a whole: 'gunzip FILE' unpacks it)",
+        ),
+        (b"PK\3\4" + MAGIC, "not an MCAP file (it is a zip archive: 'unzip FILE' unpacks it)"),
     ],
 )
 def test_a_file_that_is_no_recording(tmp_path, content, message):
@@ -80,10 +86,11 @@ def test_a_file_that_is_not_there_or_a_folder(tmp_path):
     with pytest.raises(UsageError) as caught:
         RecordingReader(tmp_path)
     assert str(caught.value) == f"{tmp_path}: it is a folder, in which no recording is"
-    (tmp_path / "bag_0.mcap").touch()
-    with pytest.raises(UsageError) as caught:
-        RecordingReader(tmp_path)
-    assert str(caught.value).endswith(f"a recording is a file: {tmp_path}/bag_0.mcap")
+    for name in ("bag_0.db3", "bag_0.mcap"):  # what SQLite holds, its own message tells
+        (tmp_path / name).touch()
+        with pytest.raises(UsageError) as caught:
+            RecordingReader(tmp_path)
+        assert str(caught.value).endswith(f"a recording is a file: {tmp_path}/{name}")
 
 
 def records(data: bytes) -> list[tuple[int, int, int]]:

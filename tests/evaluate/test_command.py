@@ -504,8 +504,12 @@ def test_recordings_may_follow_the_graph_and_folders_are_opened(
     assert only["overall"]["frames"] == 3
 
 
-def test_a_recording_that_its_folder_names_as_well_counts_once(graph: Path, tmp_path: Path) -> None:
-    content = judged(graph, tmp_path / "bed.mcap", tmp_path, "--frames", 1)
+@pytest.mark.parametrize("given", [False, True])
+def test_a_recording_that_its_folder_names_as_well_counts_once(
+    given: bool, graph: Path, tmp_path: Path
+) -> None:
+    bed = tmp_path / "bed.mcap"
+    content = judged(graph, bed, tmp_path, "--frames", 1, *(["--truth", bed] if given else []))
     (only,) = content["alternatives"]
     assert [r["name"] for r in only["recordings"]] == ["bed"]
     assert only["overall"]["frames"] == 1

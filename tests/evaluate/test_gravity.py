@@ -135,6 +135,33 @@ def test_what_is_not_gravity_along_the_cameras_axes_is_refused(
     assert text in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("frame", "why"),
+    [
+        ([], "it holds no colour images (it holds /camera/camera/accel/sample)"),
+        (plane_frame(UP)[:2], "its first frame has no depth"),
+        (plane_frame(UP)[1:], "it has no calibration"),
+        ([*plane_frame(UP), ("/b/color", T0, plane_frame(UP)[1][2])], "several topics could be co"),
+        (
+            [*plane_frame(UP)[:2], ("/depth", T0, raw_image(np.zeros((240, 320), "u2"), "16UC1"))],
+            "its first frame has too little depth",
+        ),
+        (
+            [
+                *plane_frame(UP)[:2],
+                ("/depth", T0, raw_image(np.ones((2, 2), "u2"), "16UC1", T0, "d")),
+            ],
+            "depth (/depth) is in frame 'd', colour in",
+        ),
+    ],
+)
+def test_why_no_bed_tells_of_the_axes_is_said(frame: list[Entry], why: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError) as caught:
+        measure_up(write_bag(tmp_path, [*frame, *readings(frame_id="imu_link")]))
+    assert f"are the camera's (x right, y down, z forward): {why}" in str(caught.value)
+    assert str(tmp_path) not in str(caught.value).split("forward)")[1]
+
+
 def test_other_axes_will_do_where_the_bed_shows_that_they_are_the_cameras(tmp_path: Path) -> None:
     entries = [*plane_frame(UP), *readings(frame_id="imu")]
     found = measure_up(write_bag(tmp_path, entries), ACCEL)

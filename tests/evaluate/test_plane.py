@@ -20,6 +20,7 @@ from mushpipe.evaluate.plane import PlaneRow, judge_planes, measure_plane, plane
 from mushpipe.sources.mcap import McapSource
 from mushpipe.stages.depth_correct import DepthCorrect
 from tests.evaluate.scenes import frame
+from tests.io.bags import color_at, rgbd, write_bag
 
 
 def plane(folder: Path, distance: float, offset: float, sigma: float, seed: int = 0) -> Path:
@@ -107,6 +108,24 @@ def test_a_recording_without_depth_is_refused(tmp_path: Path) -> None:
     writer.close()
     with pytest.raises(InputError, match="no depth"):
         measure_plane(path, 0.5)
+
+
+def test_of_several_cameras_a_recording_of_one_is_asked_for(tmp_path: Path) -> None:
+    """Topics are chosen by --set, which neither `eval --plane` nor `calibrate depth` takes."""
+    bag = write_bag(tmp_path, [color_at(0, topic="/a/color"), color_at(0, topic="/b/color")])
+    with pytest.raises(InputError) as caught:
+        measure_plane(bag, 0.5)
+    assert str(caught.value).endswith(
+        "choose with --set source.color_topic=/a/color or --set source.color_topic=/b/color of "
+        f"'mushpipe record --source {bag} -o NEW.mcap', and measure that one"
+    )
+
+
+def test_images_smaller_than_the_window_are_named(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path, rgbd(range(1)))
+    with pytest.raises(InputError) as caught:
+        measure_plane(bag, 0.5)
+    assert str(caught.value).startswith(f"{bag}: the depth image is smaller than the window of 31x")
 
 
 def test_command(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from mushpipe.sources.folder import ImagesSource
 from mushpipe.sources.mcap import McapSource
 from mushpipe.sources.realsense import RealsenseSource
 from tests.io.bags import (
+    ALIGNED,
     COLOR,
     PERIOD,
     STORE,
@@ -171,6 +172,22 @@ def test_what_follows_the_end_of_a_recording_is_reported(
     assert len(frames) == FRAMES
     assert error is not None
     assert f"{len(more)} bytes behind its end were not read: another recording?" in str(error)
+
+
+def test_a_bag_that_stands_twice_in_a_file_is_reported_without_checksums(tmp_path: Path) -> None:
+    """Chunks that overlap in time are played by the index, and the second one's fits the first."""
+    stamps, large = [T0 + i * PERIOD for i in range(3)], (640, 480)  # a chunk each
+    color = [raw_image(color_pixels(0, large), "rgb8", at) for at in stamps]
+    depth = [raw_image(depth_pixels(0, large), "16UC1", at) for at in stamps]
+    entries = [(COLOR, at, image) for at, image in zip(stamps, color, strict=True)]
+    entries += [(ALIGNED, at, image) for at, image in zip(stamps, depth, strict=True)]
+    bag = write_bag(tmp_path, entries)
+    assert drain(McapSource(path=bag))[1] is None
+    data = bag.read_bytes()
+    bag.write_bytes(data + data)
+    frames, error = drain(McapSource(path=bag))
+    assert [frame.header.stamp_ns for frame in frames] == stamps
+    assert f"{len(data)} bytes behind its end were not read" in str(error)
 
 
 def test_a_record_whose_type_is_damaged_is_missed(whole: Path, tmp_path: Path) -> None:

@@ -228,13 +228,23 @@ def test_what_is_no_depth_is_refused_by_name(
         played(tmp_path, color="c*.png", depth="d*.png", depth_scale=0.001)
 
 
-def test_depth_is_no_colour_and_a_damaged_file_no_image(tmp_path: Path) -> None:
+def test_depth_is_no_colour_and_a_damaged_file_no_image(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     write(tmp_path / "0.png", 400, np.uint16, 1)
     with pytest.raises(InputError, match=r"0\.png: 16 bits a channel, expected 8; where it is"):
         played(tmp_path)
     (tmp_path / "0.png").write_bytes(b"")
+    with pytest.raises(InputError, match=r"0\.png: it is empty"):
+        played(tmp_path)
+    (tmp_path / "0.png").write_bytes(b"no image")
     with pytest.raises(InputError, match=r"0\.png: it is no image, or damaged"):
         played(tmp_path)
+    (tmp_path / "0.png").unlink()
+    write(tmp_path / "0.tiff", 0.4, np.float32, 1)
+    with pytest.raises(InputError, match=r"0\.tiff: 32 bits a channel, expected 8; where it is"):
+        played(tmp_path)
+    assert capfd.readouterr().err == ""  # OpenCV says nothing of its own
 
 
 def test_a_file_of_several_images_is_refused(tmp_path: Path) -> None:

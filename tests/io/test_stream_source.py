@@ -37,6 +37,7 @@ from mushpipe.sources.stream import StreamSource
 from mushpipe.sources.topics import Topics
 from tests.cli.test_record import CAMERA, picture
 from tests.core.lab import Lab, held, soon
+from tests.io.bags import ALIGNED, COLOR, COLOR_INFO, rgbd, write_bag
 
 
 def stream(path: Path, frames: int, live: bool = False, depth: int = 0) -> Path:
@@ -237,6 +238,29 @@ def test_a_stream_without_images_names_what_it_holds(tmp_path: Path) -> None:
     source = opened(stream(tmp_path / "s.mcap", 2), color_topic="/left")
     with pytest.raises(InputError, match=r"no colour images on /left, only /camera/"):
         list(source.frames())
+
+
+def test_topics_of_another_program_are_asked_for(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A ROS 2 bag that is piped in holds depth and a calibration, but not where they are sought."""
+    bag = write_bag(tmp_path, rgbd(range(2)))
+    with pytest.raises(InputError) as caught:
+        list(opened(bag).frames())
+    assert f"{ALIGNED}, {COLOR_INFO}, {COLOR}: where they are among these, name" in str(
+        caught.value
+    )
+    caplog.clear()
+    assert len(list(opened(bag, color_topic=COLOR).frames())) == 2
+    assert caplog.messages == [
+        f"the stream, on {DEPTH_TOPIC}, has no depth: positions, distances and diameters will be "
+        "missing",
+        f"the stream has no calibration on {CAMERA_TOPIC}: nothing can be measured in metres",
+    ]
+    caplog.clear()
+    named = {"color_topic": COLOR, "depth_topic": ALIGNED, "camera_topic": COLOR_INFO}
+    assert all(frame.depth is not None for frame in opened(bag, **named).frames())
+    assert not caplog.messages
 
 
 def test_a_sender_without_images_is_not_listened_to_for_ever(

@@ -142,7 +142,8 @@ def of_size(diameter: float, n: int = 9, unknown: int = 0) -> tuple[Circles, Loc
     ("diameter", "n", "unknown", "told"),
     [
         (0.03, 9, 0, None),
-        (0.0075, 9, 0, "half of the diameters of 9 mushrooms are below 8 mm"),  # a quarter of it
+        (0.0075, 9, 0, "half of the diameters of 9 mushrooms are below 7.5 mm"),  # a quarter of it
+        (0.00004, 9, 0, "half of the diameters of 9 mushrooms are below 0.04 mm"),  # m taken for mm
         (0.12, 9, 1, "half of the diameters of 8 mushrooms are above 120 mm"),
         (0.0075, 7, 0, None),  # a few may be pins
         (0.0075, 9, 2, None),
