@@ -120,11 +120,23 @@ class Chain:
             arguments[node.ports.rng] = np.random.default_rng(
                 [self.plan.seed, name_key, frame.header.sequence]
             )
-        result = node.plugin.process(**arguments)  # type: ignore[attr-defined]
-        values = _values(result, node.ports.outputs)
         seen = [value for value in arguments.values() if isinstance(value, RgbdFrame)]
-        _check_outputs(node, values, seen[0] if seen else frame)
-        return values
+        return called(node, arguments, seen[0] if seen else frame)
+
+
+def called(node: Node, arguments: Mapping[str, Any], frame: RgbdFrame | None) -> tuple[Any, ...]:
+    """Call a stage and return its outputs.
+
+    Raises:
+        TypeError: They are not those that it declares.
+        ValueError: They do not fit the frame, if there is one.
+    """
+    result = node.plugin.process(**arguments)  # type: ignore[attr-defined]
+    values = _values(result, node.ports.outputs)
+    _check_types(node, values)
+    if frame is not None:
+        _check_fit(values, frame)
+    return values
 
 
 @contextmanager
@@ -176,8 +188,7 @@ def _values(result: Any, declared: tuple[type, ...]) -> tuple[Any, ...]:
     return (result,) if single or not isinstance(result, tuple) else result
 
 
-def _check_outputs(node: Node, values: tuple[Any, ...], frame: RgbdFrame) -> None:
-    """Raise TypeError or ValueError where outputs are not as declared, or do not fit the frame."""
+def _check_types(node: Node, values: tuple[Any, ...]) -> None:
     expected = node.ports.outputs
     matches = len(values) == len(expected) and all(map(isinstance, values, expected))
     if not matches:
@@ -186,6 +197,9 @@ def _check_outputs(node: Node, values: tuple[Any, ...], frame: RgbdFrame) -> Non
             f"declared is ({', '.join(t.__name__ for t in expected)})"
             + ("; is a `return` missing?" if len(values) == 1 and values[0] is None else "")
         )
+
+
+def _check_fit(values: tuple[Any, ...], frame: RgbdFrame) -> None:
     height, width = frame.color.shape[:2]
     for value in values:
         h, w = _size(value) or (height, width)

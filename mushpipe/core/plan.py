@@ -47,6 +47,14 @@ class Node:
             entry["delivery"] = self.delivery
         return entry
 
+    def fresh(self) -> Node:
+        """Return a node whose plugin has no state yet."""
+        # Built anew, not deep-copied: state may hold what cannot be copied, a lock say.
+        kind, plugin = type(self.plugin), self.plugin
+        fields = {name: getattr(plugin, name) for name in kind.model_fields}
+        settings = deepcopy({**fields, **(plugin.model_extra or {})})
+        return replace(self, plugin=kind.model_construct(set(settings), **settings))
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -79,19 +87,11 @@ class Plan:
 
     def fresh(self) -> Plan:
         """Return a plan whose plugins have no state yet."""
-
-        def copy(node: Node) -> Node:
-            # Built anew, not deep-copied: state may hold what cannot be copied, a lock say.
-            kind, plugin = type(node.plugin), node.plugin
-            fields = {name: getattr(plugin, name) for name in kind.model_fields}
-            settings = deepcopy({**fields, **(plugin.model_extra or {})})
-            return replace(node, plugin=kind.model_construct(set(settings), **settings))
-
         return replace(
             self,
-            source=copy(self.source),
-            stages=tuple(map(copy, self.stages)),
-            sinks=tuple(map(copy, self.sinks)),
+            source=self.source.fresh(),
+            stages=tuple(node.fresh() for node in self.stages),
+            sinks=tuple(node.fresh() for node in self.sinks),
         )
 
     def resolved(self) -> dict[str, Any]:

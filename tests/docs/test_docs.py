@@ -115,6 +115,10 @@ sinks:
     assert len(mine["circles"]) > 1
     (first, _) = mine["rows"](tmp_path / "log.mcap", "/mushpipe/ripe")
     assert (first["share"], first["grade"]) == ([None], [""])
+    tests = [name for name in mine if name.startswith("test_")]
+    assert len(tests) == 2
+    for name in tests:
+        mine[name]()
 
 
 def test_changed_settings_in_the_docs_are_accepted(tmp_path: Path) -> None:
