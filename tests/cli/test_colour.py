@@ -74,7 +74,6 @@ def test_a_notice_is_given_once_and_a_warning_each_time(
 ) -> None:
     """`eval --matrix` and `bench` open the same stages several times."""
     logger = logging.getLogger("mushpipe")
-    monkeypatch.setattr(logger, "handlers", [])
     set_up_logging(False)
     for offset in (2.85, 2.85, 3.0):
         logger.info("%g mm are taken off", offset)

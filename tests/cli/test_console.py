@@ -35,7 +35,6 @@ def test_a_notice_is_given_once_and_one_that_is_none_fails_no_frame(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     logger = logging.getLogger("mushpipe")
-    monkeypatch.setattr(logger, "handlers", [])
     monkeypatch.setattr(logger, "level", logging.NOTSET)
     monkeypatch.setattr(logger, "propagate", False)  # pytest lets no such record pass
     set_up_logging(False)

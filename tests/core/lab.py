@@ -1,6 +1,5 @@
 """A small world for tests of the framework: plugins without image processing, and a registry."""
 
-import logging
 import sys
 import threading
 from collections.abc import Iterator
@@ -175,8 +174,6 @@ def cli(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
     """Call the program in this process and return its exit code."""
     from mushpipe.cli import main
 
-    # The program sets up its log for a stream that ends with the test.
-    monkeypatch.setattr(logging.getLogger("mushpipe"), "handlers", [])
     monkeypatch.setattr(sys, "argv", ["mushpipe", *map(str, arguments)])
     with pytest.raises(SystemExit) as caught:
         main()
