@@ -23,14 +23,15 @@ from mushpipe.stages.cap.blocks import (
     own_depth,
     room_to_cut,
 )
+from mushpipe.stages.cap.depth_edge import follow
 from mushpipe.stages.cap.samples import (
     COMPASS,
     DIRECTIONS,
     INNER,
+    OUTER,
     POINT_SHARE,
     RADII,
     STEP,
-    follow,
     normalise,
     ray_at,
     sample_depth,
@@ -84,46 +85,60 @@ def test_blocks_are_the_means_of_their_valid_pixels(
             assert blocks[SPREAD, cell] == pytest.approx(valid[:, 2].var(), abs=1e-6)
 
 
-def followed(image: Image, circle: np.ndarray, j: int, gate: tuple[float, float]) -> int:
+def followed(
+    image: Image, circle: np.ndarray, j: int, gate: tuple[float, float, float, float]
+) -> int:
     """The last step of a cap in a direction, -1 where its edge is not to be trusted."""
-    best, edge, total, follows = 0.0, -1, 0.0, ""
+    best, edge, total, follows, last = 0.0, -1, 0.0, "", np.inf
+    low, high, fall, noise = gate
+    beyond = pixel(image, *np.floor(circle[:2] + circle[2] * OUTER * COMPASS[j] + 0.5).astype(int))
+    close = 0 < beyond < high + noise
     for k in range(RADII):
         far = circle[2] * (INNER + k * STEP)
         u, v = np.floor(circle[:2] + far * COMPASS[j] + 0.5).astype(int)
         z = pixel(image, u, v)
+        if close and k <= edge + 4 and z > last + max(fall * np.sqrt(k - edge), noise):
+            high = min(high, (last + z) / 2)
         if z == 0:
             total -= 0.15
-        elif z < gate[0]:
+        elif z < low:
             total -= 0.5
             follows = follows or "nearer"
-        elif z > gate[1]:
+        elif z > high:
             total -= 1
             if not follows and k <= edge + 4:
                 follows = "deeper"
         else:
             total += 1
             if total > best:
-                best, edge, follows = total, k, ""
+                best, edge, follows, last = total, k, "", z
         if edge >= 0 and total < best - 4:
             break
     return edge if follows == "deeper" else -1
 
 
 @settings(deadline=None)
-@given(seed=st.integers(0, 99), place=PLACES, low=st.floats(0.41, 0.45), high=st.floats(0.5, 0.59))
+@given(
+    seed=st.integers(0, 99),
+    place=PLACES,
+    low=st.floats(0.41, 0.45),
+    high=st.floats(0.5, 0.59),
+    fall=st.sampled_from([0.02, 0.05, 1.0]),
+)
 def test_edges_are_those_that_single_steps_find(
-    seed: int, place: tuple[float, float, float], low: float, high: float
+    seed: int, place: tuple[float, float, float], low: float, high: float, fall: float
 ) -> None:
     image = scene(seed)
     # places between pixels: single precision does not decide which
     circle = np.round(np.array(place), 1) + 0.037
     own = np.empty(image.depth.size, np.float32)
     window = own_depth(image, 1, circle, 1.45, own)
-    state, pixels = np.empty(6 * DIRECTIONS, np.float32), np.empty(DIRECTIONS, np.int32)
-    follow(window, own, circle, (low, high), state, pixels)
-    rows = state.reshape(6, DIRECTIONS)
+    state, pixels = np.empty(9 * DIRECTIONS, np.float32), np.empty(DIRECTIONS, np.int32)
+    gate = (low, high, fall, 0.06)
+    follow(window, own, circle, gate, state, pixels)
+    rows = state.reshape(9, DIRECTIONS)
     found = np.where(rows[4] > 0, rows[3], -1)
-    expected = [followed(image, circle, j, (low, high)) for j in range(DIRECTIONS)]
+    expected = [followed(image, circle, j, gate) for j in range(DIRECTIONS)]
     # at a distance that is half a pixel but for rounding either pixel is right
     assert (found != expected).mean() <= 1 / DIRECTIONS
 

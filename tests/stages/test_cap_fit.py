@@ -193,6 +193,22 @@ def test_a_darker_rim_on_ground_as_bright_as_the_cap_makes_it_no_smaller(
     assert abs(np.mean(errors)) < 0.7
 
 
+@pytest.mark.parametrize("below", [0.35, 0.4, 0.45, 0.5])
+def test_ground_close_below_the_rim_makes_a_low_cap_no_larger(below: float) -> None:
+    """In colour nothing shows; of the ground, so many radii below the rim, the noise is usual."""
+    errors, z = [], []
+    for turn in range(0, 360, 60):
+        c, rng = cap(8, turn, (0, 0, 0.31), 0.0145, 0.6), np.random.default_rng(turn)
+        depth, gray = draw([c], 0.31 + below * c.radius)
+        depth += 0.0007 * rng.standard_normal(depth.shape)
+        frame = frame_from(depth, np.full_like(gray, 0.5))
+        found, _, _ = CapFit(edge_offset_px=0).process(frame, circles_of([c]))
+        errors.append(1e3 * (found.diameter[0] - 2 * c.radius))
+        z.append(1e-3 * errors[-1] / found.sigma_diameter[0])
+    assert np.abs(errors).max() < 0.5
+    assert np.abs(z).max() < 2
+
+
 def test_an_outline_that_no_depth_edge_confirms_widens_the_sigmas() -> None:
     true = cap(15, 60, (0, 0, 0.4), 0.022, 0.55)
     depth, gray = draw([true], 0.44)

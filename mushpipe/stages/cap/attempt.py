@@ -13,6 +13,7 @@ import numpy as np
 from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.jit import borrower, jit
 from mushpipe.stages.cap.blocks import Cut, Image, Sensor, own_depth, room_to_cut
+from mushpipe.stages.cap.depth_edge import sample_edges
 from mushpipe.stages.cap.model import HEIGHT, ROOM, SIZE
 from mushpipe.stages.cap.outline import LANES_ROOM, Lanes, expected_reach, sample_outline
 from mushpipe.stages.cap.regrow import denials, regrow, slack
@@ -25,7 +26,6 @@ from mushpipe.stages.cap.samples import (
     place,
     ray_at,
     sample_depth,
-    sample_edges,
     touch,
 )
 from mushpipe.stages.cap.solve import (
@@ -138,7 +138,7 @@ def gather(
     if n == 0:
         return 0, other, 0, 0.0
     edges = rays[:, ROUND + n :]
-    m = sample_edges(window, cut.own, image, circle, middle, sensor.edge, lanes, edges)
+    m = sample_edges(window, cut.own, image, circle, middle, sensor, lanes, edges)
     for j in range(ROUND):
         turn = COMPASS[j * (DIRECTIONS // ROUND)]
         x, y = circle[0] + circle[2] * turn[0], circle[1] + circle[2] * turn[1]

@@ -1,4 +1,4 @@
-"""What a depth image says about each cap: points on a grid inside its circle, and its depth edge.
+"""What a depth image says about each cap: points on a grid inside its circle; rays that touch it.
 
 Kernels work on depth in metres, 0 = missing, and on the rays of all pixels; they assume finite
 numbers.
@@ -34,7 +34,6 @@ DIRECTIONS = 32
 RADII = 26
 INNER, OUTER = 0.55, 1.45  # where an edge is looked for, in radii of the circle,
 STEP = (OUTER - INNER) / (RADII - 1)  # in so many steps
-EDGE_PX = 2.0  # sigma of a depth edge
 # Noise and errors of shape are correlated; so much of a point, or of a ray along an edge, counts.
 POINT_SHARE, EDGE_SHARE = 0.35 * 169 / GRID**2, 0.6
 ASTRAY = 1 / 3  # share of other depth in a circle: is what its centre shows the cap at all?
@@ -108,130 +107,6 @@ def _taken(pixels: Ints32, cell: int) -> bool:
     for k in range(cell):
         taken |= pixels[k] == pixels[cell] and pixels[k + K] == pixels[cell + K]
     return taken
-
-
-@borrower
-def look_around(
-    window: Window, own: Singles, at: tuple[float, float], far: float, state: Singles,
-    pixels: Ints32,
-) -> None:  # fmt: skip
-    """Put the depth in each direction into the last row of `state`, 0 outside of the window.
-
-    Args:
-        window: From `own_depth`.
-        own: (H W,) its depth.
-        at: x and y to look from, half a pixel added, in the window.
-        far: Distance, px.
-        state: As in `follow`.
-        pixels: (DIRECTIONS or more,) room.
-    """
-    width, height, none = np.int32(window.width), np.int32(window.height), Single(0)
-    for j in range(DIRECTIONS):
-        u, v = np.int32(np.floor(at[0] + far * EAST[j])), np.int32(np.floor(at[1] + far * SOUTH[j]))
-        inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
-        pixels[j] = v * width + u if inside else -1
-    for j in range(DIRECTIONS):
-        z = own[max(pixels[j], 0)]
-        state[j + 5 * DIRECTIONS] = z if pixels[j] >= 0 else none
-
-
-@borrower
-def follow(
-    window: Window,
-    own: Singles,
-    circle: Floats,
-    gate: tuple[float, float],
-    state: Singles,
-    pixels: Ints32,
-) -> None:
-    """Find the last step of a cap in each direction, where its edge is to be trusted.
-
-    The edge is the maximum of a running sum that rewards what lies within the cap's depth and
-    punishes the rest: deeper by 1, nearer or another's by 1/2, missing by 0.15. It counts only
-    where something deeper follows within 4 steps, for there the cap ends and is not merely hidden.
-
-    Args:
-        window: From `own_depth`.
-        own: (H W,) its depth.
-        circle: (3,) x, y, radius, px.
-        gate: Depths of the cap, m.
-        state: (6 DIRECTIONS or more,) out, rows of DIRECTIONS: whether it goes on, the sum, its
-            maximum, the step of that (-1 without), and what follows it: 1 something deeper, -1
-            something nearer, 0 neither yet; then the depth at the last step. In one array at fixed
-            distances the compiler sees that nothing overlaps, and works on several directions at
-            once.
-        pixels: (DIRECTIONS or more,) room.
-    """
-    none, one, low, high = Single(0), Single(1), Single(gate[0]), Single(gate[1])
-    half, little, four = Single(0.5), Single(0.15), Single(4)
-    at = (Single(circle[0] - window.left + 0.5), Single(circle[1] - window.top + 0.5))
-    for j in range(DIRECTIONS):
-        state[j], state[j + DIRECTIONS], state[j + 2 * DIRECTIONS] = one, none, none
-        state[j + 3 * DIRECTIONS], state[j + 4 * DIRECTIONS] = -one, none
-    for k in range(RADII):
-        step, going = Single(k), none
-        look_around(window, own, at, Single(circle[2] * (INNER + k * STEP)), state, pixels)
-        for j in range(DIRECTIONS):
-            on, total = state[j] > none, state[j + DIRECTIONS]
-            best, edge = state[j + 2 * DIRECTIONS], state[j + 3 * DIRECTIONS]
-            follows, z = state[j + 4 * DIRECTIONS], state[j + 5 * DIRECTIONS]
-            missing, deeper = z == none, z > high
-            nearer = (z < low) & (z != none)  # or another's
-            change = -half if nearer else (-little if missing else (-one if deeper else one))
-            total += change if on else none
-            top = on & (change == one) & (total > best)
-            ends = one if deeper & (step <= edge + four) else none
-            ends = -one if nearer else ends
-            follows = ends if on & (follows == none) else follows
-            best, edge = total if top else best, step if top else edge
-            on = on & ((edge < none) | (total >= best - four))
-            state[j], state[j + DIRECTIONS] = one if on else none, total
-            state[j + 2 * DIRECTIONS], state[j + 3 * DIRECTIONS] = best, edge
-            state[j + 4 * DIRECTIONS] = none if top else follows
-            going += one if on else none
-        if going == none:
-            break
-
-
-@borrower
-def sample_edges(
-    window: Window,
-    own: Singles,
-    image: Image,
-    circle: Floats,
-    middle: float,
-    offset: float,
-    room: tuple[Singles, Ints32],
-    out: Singles,
-) -> int:
-    """Find the depth edge of a cap in 32 directions.
-
-    Args:
-        window: From `own_depth`, not empty.
-        own: (H W,) its depth.
-        image: What the window was cut out of.
-        circle: (3,) x, y, radius, px.
-        middle: Middle depth of the cap, m.
-        offset: How much of its edge the sensor loses, px.
-        room: As `state` and `pixels` of `follow`.
-        out: (6, DIRECTIONS) out: rays that touch the cap, as in `touch`.
-
-    Returns:
-        Number of trusted edge rays.
-    """
-    size, state = circle[2] * middle / image.focal, room[0]
-    gate = (middle - 0.8 * size, middle + 0.95 * size)
-    follow(window, own, circle, gate, state, room[1])
-    n = 0
-    for j in range(DIRECTIONS):
-        edge = state[j + 3 * DIRECTIONS]
-        if edge < 0.0 or state[j + 4 * DIRECTIONS] <= 0.0:
-            continue
-        reach = circle[2] * (INNER + (edge + 0.5) * STEP) + offset
-        x, y = circle[0] + reach * COMPASS[j, 0], circle[1] + reach * COMPASS[j, 1]
-        touch(out, n, place(image, x, y), EDGE_PX * middle / image.focal, EDGE_SHARE)
-        n += 1
-    return n
 
 
 @borrower
