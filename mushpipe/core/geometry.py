@@ -83,8 +83,7 @@ def _block_inverse(wanted: Floats, coefficients: tuple[float, ...]) -> Floats:
     x, y = wanted_x.copy(), wanted_y.copy()
     with np.errstate(all="ignore"):
         # A wide lens ends inside the image, and of what lies beyond nothing would converge.
-        reach = _farthest_image(coefficients, fold)
-        left = np.flatnonzero(~(np.hypot(wanted_x, wanted_y) > reach))
+        left = np.flatnonzero(~(np.hypot(wanted_x, wanted_y) > _farthest_image(coefficients)))
         for _ in range(_ROUNDS):
             u, v = x[left], y[left]
             r2 = u * u + v * v
@@ -122,8 +121,10 @@ def _newton(
     return (yy * off[0] - xy * off[1]) / det, (xx * off[1] - xy * off[0]) / det
 
 
-def _farthest_image(coefficients: tuple[float, ...], fold: float) -> float:
-    """Return how far from the centre the image of a point short of the fold (r^2) can lie."""
+@cache
+def _farthest_image(coefficients: tuple[float, ...]) -> float:
+    """Return how far from the centre the image of a point short of the fold can lie."""
+    fold = _fold(coefficients)
     if not np.isfinite(fold):
         return np.inf
     reach = np.sqrt(fold)
