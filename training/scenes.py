@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -158,12 +158,16 @@ def choosing_cases(cache: Path) -> Iterator[Case]:
     return _cases(CHOOSING, CHOOSING_SEED, 5, cache)
 
 
-def judging_cases(cache: Path, count: int = 3, tables: int = 1) -> Iterator[Case]:
+def judging_cases(
+    cache: Path, count: int = 3, tables: int = 1, only: Collection[str] = JUDGED
+) -> Iterator[Case]:
     """Yield frames for judging only: per condition `count` of each family, unseen seeds.
 
     Tables hold few caps: so many times as many frames of them.
     """
     for number, condition in enumerate(JUDGED):
+        if condition not in only:
+            continue
         times = tables if CONDITIONS[condition].get("scene") == "lab" else 1
         for family in "ab":
             for k in range(times * count):

@@ -28,7 +28,7 @@ from training.net.scenes import (
     sparse_cases,
     varied_cases,
 )
-from training.scenes import Case, choosing_cases, judging_cases, recorded_cases
+from training.scenes import JUDGED, Case, choosing_cases, judging_cases, recorded_cases
 from training.verifier import RADII, segmentations
 
 OPEN = (8.0, None)  # as graphs/pick.yaml has it: the largest radius is left to what is seen
@@ -109,6 +109,7 @@ def main() -> None:
     parser.add_argument("--choosing", action="store_true", help="the frames for choices of design")
     parser.add_argument("--each", type=int, default=EACH, help="frames of a row per shape family")
     parser.add_argument("--varied", type=int, default=VARIED, help="how many varied frames")
+    parser.add_argument("--only", choices=JUDGED, help="one row instead of all")
     parser.add_argument("--sparse", type=int, help="so many beds with few caps or none, instead")
     parser.add_argument("--field", type=Path, help="labelled real recordings instead")
     parser.add_argument("--recordings", type=Path, nargs="+", help="with truth, instead")
@@ -118,6 +119,8 @@ def main() -> None:
             print(line)
     else:
         cases = scenes(arguments.cache, arguments.choosing, arguments.each, arguments.varied)
+        if arguments.only:
+            cases = judging_cases(arguments.cache, arguments.each, TABLES, [arguments.only])
         if arguments.sparse:
             cases = sparse_cases(arguments.cache, SPARSE_JUDGING_SEED, "b", arguments.sparse)
         if arguments.recordings:
