@@ -138,7 +138,7 @@ class _Runner:
                 continue
             try:
                 plugin.finish(self.report.summary())
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 failed = failure(feeder.node, None, error, "finish")
                 self.report.error = self.report.error or failed
                 logger.warning("%s", failed)
