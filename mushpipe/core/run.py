@@ -99,7 +99,8 @@ class _Runner:
             with interruptible_opening(source, self.stop):
                 stack.enter_context(opened(self.plan.source, opener(self.plan.source)))
             durations = self.report.durations[self.plan.source.name]
-            self.reader = SourceThread(self.plan.source, source, threading.Event(), durations)
+            with named(self.plan.source, "live"):
+                self.reader = SourceThread(self.plan.source, source, threading.Event(), durations)
             info = self._begin(source)
             written = {node.name: files_of(node, info) for node in self.plan.sinks}
             spare_files(files_read(self.plan), written)

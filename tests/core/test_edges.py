@@ -170,6 +170,17 @@ def test_a_source_that_fails_is_named(lab: Lab, error):
     assert (report.processed, report.exit_code) == (2, 1)
 
 
+def test_a_source_that_cannot_say_whether_it_is_live_is_named(lab: Lab):
+    class Unsure(Frames):
+        @property
+        def live(self) -> bool:
+            raise OSError("unplugged")
+
+    lab.registry.source("unsure", Unsure)
+    report = lab.run(lab.chain("threshold", source="unsure"))
+    assert "source 'source' (unsure) failed in live(): OSError: unplugged" in str(report.error)
+
+
 def test_a_source_that_fails_before_its_first_frame_does_not_hang(lab: Lab):
     def frames():
         raise InputError("no camera")
