@@ -13,11 +13,13 @@ from typing import Any
 import orjson
 from google.protobuf.message import DecodeError
 from mcap_protobuf.decoder import DecoderFactory
+from pydantic import ValidationError
 
 from mushpipe.core.edges import limited
 from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.manifest import sha256
 from mushpipe.core.recording import MANIFEST, Index, Raw, RecordingReader
+from mushpipe.core.settings import told
 from mushpipe.core.types import Header, Mask, RgbdFrame, Trace
 from mushpipe.core.wire import (
     COLOR_TOPIC,
@@ -28,6 +30,7 @@ from mushpipe.core.wire import (
     decode_table,
 )
 
+_PARTS = ("initial", "color", "depth")  # images of an output, each on a topic of its own
 LOST = 256  # results of so many frames without images are kept, in case those come later
 
 
@@ -99,7 +102,7 @@ def read_traces(path: Path, played: Mapping[str, Any] = MappingProxyType({})) ->
         played: Settings of the source `mcap` to play it with.
 
     Raises:
-        UsageError: The images are not to be found.
+        UsageError: The images are not to be found, or another source than `mcap` played them.
         InputError: After the last good frame: one of the two files is damaged.
     """
     from mushpipe.sources.mcap import McapSource
@@ -119,7 +122,13 @@ def read_traces(path: Path, played: Mapping[str, Any] = MappingProxyType({})) ->
     order = list(manifest.get("graph", {}).get("stages", {}))
     reader = RecordingReader(path)
     results = _Results(reader)
-    source = McapSource.model_validate({**images, **played})
+    try:
+        source = McapSource.model_validate({**images, **played})
+    except ValidationError as error:
+        raise UsageError(
+            f"{path} holds no images, and those of {images['path']} were not played by the source "
+            f"'mcap' ({told(error)}): run it again with 'frames: true' in its sink 'mcap'"
+        ) from error
     for frame in limited(source.frames(), source):
         try:
             trace = _trace(frame, results.take(frame.header), order)
@@ -194,16 +203,15 @@ def _trace(frame: RgbdFrame, messages: list[Raw], order: list[str]) -> Trace:
             outputs[stage] = (*outputs.get(stage, ()), decoded.table if decoded else None)
         elif schema == "foxglove.RawImage" and (image := _image(raw)) is not None:
             # what is not a stage's first output stands below its type
-            images.setdefault(stage, {})[part.rpartition("/")[2].removeprefix("mask")] = image
+            name = part.rpartition("/")[2]
+            images.setdefault(stage, {})[name if name in _PARTS else ""] = image
             if NO_DEPTH.items() <= raw.channel.metadata.items():
                 images[stage]["depth"] = (None, frame.depth_scale)
     last = frame
     for stage, parts in images.items():
-        if parts.keys() == {"initial"}:  # of a mask that was lost
-            continue
-        value = _of_images(last, parts)
-        last = value if isinstance(value, RgbdFrame) else last
-        outputs[stage] = (value, *outputs.get(stage, ()))
+        values = list(_of_images(last, parts))
+        last = next((value for value in values if isinstance(value, RgbdFrame)), last)
+        outputs[stage] = (*values, *outputs.get(stage, ()))
     return Trace(frame, {stage: values for stage, values in outputs.items() if values}, durations)
 
 
@@ -220,11 +228,11 @@ def _image(raw: Raw) -> Any:
     return None if scale is None else decode_depth(message, float(scale))
 
 
-def _of_images(last: RgbdFrame, parts: Mapping[str, Any]) -> Mask | RgbdFrame:
-    """Return the mask a stage's images are, or the frame they make of the last one before it."""
+def _of_images(last: RgbdFrame, parts: Mapping[str, Any]) -> Iterator[Mask | RgbdFrame]:
+    """Yield the mask a stage's images are, and the frame they make of the last one before it."""
+    if "" in parts:  # else the mask was lost
+        yield Mask(*(parts[name][..., 0] > 0 for name in ("", "initial") if name in parts))
     if "color" in parts or "depth" in parts:
         depth, scale = parts.get("depth", (last.depth, last.depth_scale))
         color = parts.get("color", last.color)
-        return replace(last, color=color, depth=depth, depth_scale=scale)
-    masks = {name: pixels[..., 0] > 0 for name, pixels in parts.items()}
-    return Mask(masks[""], masks.get("initial"))
+        yield replace(last, color=color, depth=depth, depth_scale=scale)

@@ -145,7 +145,7 @@ def opened(node: Node, opener: Callable[[], None]) -> Iterator[Plugin]:
             opener()
         yield node.plugin
     except BaseException:
-        with suppress(Exception):  # the first error is the one to report
+        with suppress(Exception, SystemExit):  # the first error is the one to report
             node.plugin.close()
         raise
     with named(node, "close"):

@@ -99,7 +99,8 @@ class _Runner:
             with interruptible_opening(source, self.stop):
                 stack.enter_context(opened(self.plan.source, opener(self.plan.source)))
             durations = self.report.durations[self.plan.source.name]
-            self.reader = SourceThread(self.plan.source, source, threading.Event(), durations)
+            with named(self.plan.source, "live"):
+                self.reader = SourceThread(self.plan.source, source, threading.Event(), durations)
             info = self._begin(source)
             written = {node.name: files_of(node, info) for node in self.plan.sinks}
             spare_files(files_read(self.plan), written)
@@ -138,7 +139,7 @@ class _Runner:
                 continue
             try:
                 plugin.finish(self.report.summary())
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 failed = failure(feeder.node, None, error, "finish")
                 self.report.error = self.report.error or failed
                 logger.warning("%s", failed)

@@ -279,7 +279,7 @@ def decode_table(schema_name: str, data: bytes, log_time: int = 0) -> Decoded | 
     """Read a table back; None where the schema is not one of ours.
 
     Raises:
-        ValueError: The message does not fit its type.
+        ValueError, KeyError, TypeError: The message does not fit its type.
     """
     cls = TABLES.get(schema_name)
     if cls is None:

@@ -29,9 +29,9 @@ def wire(
     Of stages that are `unknown`, by their names, nobody can say what they produce: what may come
     from them is no fault.
 
-    An output that nobody takes becomes a warning of the document, and so do an input that is left
-    open though a stage above needs one of that name, and locations or poses that are of other
-    circles than those they come together with.
+    A stage of whose outputs nobody takes one becomes a warning of the document, and so do an input
+    that is left open though a stage above needs one of that name, and locations or poses that are
+    of other circles than those they come together with.
     """
     problems = _check_names(document, nodes)
     for position, node in enumerate(nodes):

@@ -181,9 +181,9 @@ def _nothing_fits(verdicts: Sequence[Verdict]) -> bool:
 def _require_exact(results: Results, truth: TruthSet) -> None:
     """Raise InputError where a label has the stamp of a frame as another program rounded it."""
     stamps = {header.stamp_ns for header, _ in results.frames}
-    rounded = {value: stamp for stamp in stamps for value in _rounded(stamp)}
+    rounded = {value: stamp for stamp in stamps for value in _rounded(stamp) - stamps}
     for kind, value in truth.frames if truth.recording is None else ():
-        if kind == "stamp_ns" and value in rounded.keys() - stamps:
+        if kind == "stamp_ns" and value in rounded:
             raise InputError(
                 f"{truth.name}: no frame has the stamp_ns {value}: it is {rounded[value]}, rounded "
                 "as by programs that keep numbers as floating point or in milliseconds; write all "

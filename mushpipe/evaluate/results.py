@@ -160,8 +160,8 @@ def read_results(path: Path, topic: str | None = None) -> Results:
         if raw.channel.topic == TIMING_TOPIC:
             _add_durations(results, raw)
         else:
-            header, table = _decode(path, raw)
-            found[header.stamp_ns, header.sequence] = header, _detections(table)
+            header, detections = _decode(path, raw)
+            found[header.stamp_ns, header.sequence] = header, detections
     results.frames = list(found.values())
     results.damage = list(reader.damage)
     return results
@@ -184,20 +184,17 @@ def _choose(reader: RecordingReader, index: Index, topic: str | None) -> str:
     return topic or candidates[0]
 
 
-def _decode(path: Path, raw: Raw) -> tuple[Header, Columns]:
+def _decode(path: Path, raw: Raw) -> tuple[Header, Detections]:
     try:
         decoded = decode_table(raw.table, raw.message.data, raw.message.log_time)
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: a message on {raw.channel.topic}: {error}") from error
-    if decoded is None:
-        raise InputError(f"{path}: {raw.channel.topic} holds no table of mushpipe")
-    return decoded.header, decoded.table
-
-
-def _detections(table: Columns) -> Detections:
-    if isinstance(table, Picks):
-        return of_picks(table)
-    return of_circles(table) if isinstance(table, Circles) else Detections.unknown(0)
+    if decoded is not None and isinstance(decoded.table, Picks):
+        return decoded.header, of_picks(decoded.table)
+    if decoded is not None and isinstance(decoded.table, Circles):
+        return decoded.header, of_circles(decoded.table)
+    held = f"{raw.channel.topic} holds {raw.table or 'messages without a schema'} as well"
+    raise InputError(f"{path}: {held}, expected picks or circles alone")
 
 
 def _add_durations(results: Results, raw: Raw) -> None:

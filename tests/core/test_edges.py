@@ -68,19 +68,27 @@ def test_a_close_that_fails_stops_no_other(lab: Lab, where):
     assert (report.exit_code, report.processed) == (1, 3)
 
 
-def test_a_sink_that_fails_to_finish(lab: Lab):
-    report = lab.run(recorded(lab, [], "finish sink"))
-    text = "sink 'out' (rec-sink) failed in finish(): OSError: finish sink (run -v says where)"
-    assert str(report.error) == text
+@pytest.mark.parametrize("error", [OSError, SystemExit])
+def test_a_sink_that_fails_to_finish(lab: Lab, error):
+    seen: list[str] = []
+    report = lab.run(recorded(lab, seen, "finish sink", error=error))
+    reason = f"{error.__name__}: finish sink (run -v says where)"
+    assert str(report.error) == f"sink 'out' (rec-sink) failed in finish(): {reason}"
+    assert seen[-3:] == ["close sink", "close stage", "close source"]
 
 
-def recorded(lab: Lab, calls: list[str], fails: str = "") -> str:
-    """A graph whose plugins note how they are called; the named call fails."""
+def test_leaving_in_close_does_not_hide_why_nothing_was_opened(lab: Lab):
+    report = lab.run(recorded(lab, [], "open sink", "close stage", error=SystemExit))
+    assert "failed in open(): SystemExit: open sink" in str(report.error)
+
+
+def recorded(lab: Lab, calls: list[str], *fails: str, error: type[BaseException] = OSError) -> str:
+    """A graph whose plugins note how they are called; the named calls fail."""
 
     def note(what: str) -> None:
         calls.append(what)
-        if what == fails:
-            raise OSError(what)
+        if what in fails:
+            raise error(what)
 
     class RecSource(Frames):
         def open(self) -> None:
@@ -160,6 +168,17 @@ def test_a_source_that_fails_is_named(lab: Lab, error):
     reason = f"{type(error).__name__}: {error}"
     assert str(report.error) == f"source 'source' (own) failed: {reason} (run -v says where)"
     assert (report.processed, report.exit_code) == (2, 1)
+
+
+def test_a_source_that_cannot_say_whether_it_is_live_is_named(lab: Lab):
+    class Unsure(Frames):
+        @property
+        def live(self) -> bool:
+            raise OSError("unplugged")
+
+    lab.registry.source("unsure", Unsure)
+    report = lab.run(lab.chain("threshold", source="unsure"))
+    assert "source 'source' (unsure) failed in live(): OSError: unplugged" in str(report.error)
 
 
 def test_a_source_that_fails_before_its_first_frame_does_not_hang(lab: Lab):

@@ -13,11 +13,12 @@ from click.testing import Result
 from mcap.writer import Writer
 from typer.testing import CliRunner
 
-from mushpipe import Picks
+from mushpipe import Locations, Picks
 from mushpipe.cli import app
 from mushpipe.core.errors import EXIT_DAMAGED, EXIT_DIFFERS, InputError, UsageError
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.wire import table_schema
+from mushpipe.evaluate.results import read_results
 from mushpipe.evaluate.running import Alternative, plans, result_path, unique_names
 from tests.evaluate.scenes import (
     bed,
@@ -575,6 +576,17 @@ def test_a_recording_is_not_a_result(tmp_path: Path, truths: dict[int, Any]) -> 
     result = run(write_recording(tmp_path / "bed.mcap", truths))
     assert isinstance(result.exception, InputError)
     assert "no picks or circles" in str(result.exception)
+
+
+def test_what_else_stands_on_a_topic_of_picks_is_no_empty_bed(
+    tmp_path: Path, truths: dict[int, Any]
+) -> None:
+    truth, writer = truths[0], RecordingWriter(path := tmp_path / "out.mcap", {})
+    for value in (Locations.unknown(len(truth)), picks_of(truth), Locations.unknown(0)):
+        writer.value("/mushpipe/pick", value, header(0))
+    writer.close()
+    with pytest.raises(InputError, match=r"/mushpipe/pick holds mushpipe\.Locations as well"):
+        read_results(path, "/mushpipe/pick")
 
 
 def test_gravity_changes_what_upright_means(perfect: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from mushpipe.core.manifest import _describe
 from mushpipe.core.recorder import RecordingWriter
 from mushpipe.core.recording import MANIFEST
 from mushpipe.sinks.mcap import McapSink
+from mushpipe.sources.folder import ImagesSource
 from mushpipe.sources.mcap import McapSource
 from mushpipe.traces import read_trace, read_traces
 from tests.io.values import make_circles, make_frame, make_picks, no_picks, record, trace_of
@@ -121,6 +122,25 @@ def test_a_mask_comes_back_that_is_not_the_first_thing_a_stage_puts_out(tmp_path
     same(found, Mask(mask, ~mask))
 
 
+@dataclass(frozen=True, eq=False)
+class Marked(Mask):
+    """A plugin's own kind of mask."""
+
+
+@pytest.mark.parametrize("kind", [Mask, Marked])
+def test_a_mask_and_a_frame_of_one_stage_come_back_both(tmp_path: Path, kind: type[Mask]) -> None:
+    frame, pixels = make_frame(), np.zeros((24, 32), bool)
+    pixels[3:9, 4:7] = True
+    mask = kind(pixels, ~pixels)
+    dark, darker = (replace(frame, color=frame.color // k, attached={}) for k in (2, 3))
+    outputs = {"one": (mask, dark), "other": (darker, mask)}
+    path = record(tmp_path / "out.mcap", [trace_of(frame, **outputs)])
+    (trace,) = read_traces(path)
+    for found, changed in zip(trace.outputs.values(), (dark, darker), strict=True):
+        same(found[0], Mask(pixels, ~pixels))
+        same(found[1], changed)
+
+
 def test_frames_whose_stamp_stands_still_stay_apart(tmp_path: Path) -> None:
     traces = [full_trace(i) for i in range(3)]
     stamp = traces[0].frame.header.stamp_ns
@@ -154,6 +174,21 @@ def test_images_are_played_as_the_run_played_them(tmp_path: Path) -> None:
     assert [trace.frame.header for trace in found] == [t.frame.header for t in traces[1:]]
     assert [trace.frame.camera.fx for trace in found if trace.frame.camera] == [5, 5]
     assert all(trace.outputs for trace in found)
+
+
+def test_images_that_another_source_played_are_told_of(tmp_path: Path) -> None:
+    image, results = tmp_path / "bed.png", tmp_path / "out.mcap"
+    image.write_bytes(b"an image")
+    played = ImagesSource(path=image)
+    source = {"use": "images", **played.model_dump(mode="json")}
+    manifest = {"graph": {"source": source, "stages": {}}, "recordings": [_describe(image)]}
+    sink = McapSink(path=results, frames=False)
+    sink.open(RunInfo("bed", manifest))
+    sink.consume(full_trace(0))
+    sink.close()
+    text = rf"out\.mcap holds no images, and those of {image} were not played by the source 'mcap'"
+    with pytest.raises(UsageError, match=text):
+        list(read_traces(results))
 
 
 def test_images_come_from_the_recording_named_in_the_manifest(tmp_path: Path) -> None:
