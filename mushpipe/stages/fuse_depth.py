@@ -1,4 +1,4 @@
-"""Depth averaged over the last frames, without mixing what lies behind with what lies before."""
+"""A running mean of depth, without mixing what lies behind with what lies before."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mushpipe.core.jit import jit
 from mushpipe.core.types import end_of_scale
 
 SIGMAS = 4.0  # of depth noise, which the gate lets pass
-# What was seen longer ago is no part of what is seen now: robots are told the age of the frame.
+# What was seen longer ago fills no hole: robots are told the age of the frame.
 LONGEST_NS = 500_000_000
 
 
@@ -55,7 +55,10 @@ def nothing(shape: tuple[int, ...]) -> Memory:
 
 
 class FuseDepth(Stage):
-    """Averages depth over the last frames of a camera at rest, and fills holes from them.
+    """Averages the depth of a camera at rest, and fills holes from the last frames.
+
+    The first `frames` frames weigh alike; then each new one counts a `frames`-th, and what was
+    seen before it fades.
 
     A pixel whose depth leaves its mean by more than the gate starts anew: it sees another surface
     now. The gate widens with depth, as noise does. A pixel without depth keeps its mean until it
@@ -64,7 +67,7 @@ class FuseDepth(Stage):
     without a frame, and where stamps go back.
     """
 
-    frames: int = Field(5, ge=1, le=100, description="frames that are averaged")
+    frames: int = Field(5, ge=1, le=100, description="a frame counts one of so many")
     gate_mm: float = Field(
         4.0, gt=0, le=100, description="least step of depth at which a pixel starts anew"
     )
@@ -135,7 +138,7 @@ def fuse(
         depth: (H, W) native, 0 = missing, finite.
         memory: In and out.
         gate: What is mixed with it.
-        frames: Most frames that a mean holds.
+        frames: A frame is at least one of so many parts of a mean.
         longest: How many frames without depth a mean outlasts.
 
     Returns:

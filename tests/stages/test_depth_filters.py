@@ -33,6 +33,19 @@ def test_noise_falls_by_the_root_of_the_number_of_frames() -> None:
     assert out.depth.mean() == pytest.approx(4000, abs=0.5)
 
 
+def test_a_step_that_the_gate_lets_pass_fades() -> None:
+    stage = FuseDepth(frames=5)
+    stage.open()
+    for _ in range(5):
+        stage.process(frame(np.full(SHAPE, 500, np.uint16)))
+    left = []
+    for _ in range(10):
+        depth = stage.process(frame(np.full(SHAPE, 503, np.uint16))).depth
+        assert depth is not None
+        left.append((503 - depth[0, 0]) / 3)
+    assert left == pytest.approx([0.8**k for k in range(1, 11)], rel=1e-3)
+
+
 @pytest.mark.parametrize("z", [0.4, 0.95, 1.5, 3.0])
 def test_noise_as_it_is_at_a_distance_starts_no_pixel_anew(z: float) -> None:
     rng, stage = np.random.default_rng(0), FuseDepth(frames=5)
