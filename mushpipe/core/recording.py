@@ -107,7 +107,7 @@ class RecordingReader:
 
     Messages come in file order, sorted by log time within a chunk, and from chunk to chunk where
     these lie side by side in time. Afterwards ``damage`` says, in words, what could not be read,
-    and ``unchecked`` whether a chunk had no CRC: bytes that changed in it show nowhere.
+    and ``unchecked`` whether messages had no CRC: bytes that changed in them show nowhere.
 
     Raises:
         UsageError: There is no such file, or it is a pipe.
@@ -193,7 +193,9 @@ class RecordingReader:
             try:
                 for record in reader.records:
                     # What the summary repeats was read already; it goes on to the last byte.
-                    in_summary |= isinstance(record, DataEnd)
+                    if isinstance(record, DataEnd):
+                        in_summary = True
+                        self.unchecked |= loose and not record.data_section_crc
                     if in_summary:
                         continue
                     if not isinstance(record, Chunk):

@@ -169,8 +169,10 @@ def slower(result: Mapping[str, Any], baseline: Mapping[str, Any]) -> dict[str, 
     now = {**result["nodes"], "all stages": result["frame"]}
     return {
         name: now[name]["p50_ms"] / before[name]["p50_ms"]
-        for name in now.keys() & before.keys()
-        if before[name]["p50_ms"] > 0 and now[name]["p50_ms"] >= 0  # NaN of what had no frame
+        for name in now  # in the order of the graph
+        if name in before
+        and before[name]["p50_ms"] > 0
+        and now[name]["p50_ms"] >= 0  # NaN of what had no frame
     }
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 import pytest
+from mcap.writer import Writer
 from pydantic import Field
 
 from mushpipe import Circles, Mask, Registry, RgbdFrame, Sink, Stage
@@ -56,6 +57,20 @@ def test_a_bag_without_checksums_says_so(tmp_path: Path) -> None:
     assert render(describe(write_bag(tmp_path, rgbd(range(1))))).splitlines()[-1] == note
     checked = record(tmp_path / "out.mcap", [trace_of(make_frame(), detect=make_circles())])
     assert note not in render(describe(checked))
+
+
+@pytest.mark.parametrize("checked", [True, False])
+def test_without_chunks_only_the_checksum_of_all_data_tells(checked: bool, tmp_path: Path) -> None:
+    path = tmp_path / "flat.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, use_chunking=False, enable_data_crcs=checked)
+        writer.start()
+        schema = writer.register_schema("std_msgs/msg/Empty", "ros2msg", b"")
+        topic = writer.register_channel("/a", "cdr", schema)
+        writer.add_message(topic, T0, b"0000", T0)
+        writer.finish()
+    content = describe(path)
+    assert (content["damage"], content["unchecked"]) == ([], not checked)
 
 
 def test_results_carry_the_manifest_of_their_run(tmp_path: Path) -> None:

@@ -184,6 +184,12 @@ def test_a_node_is_compared_with_itself_in_the_baseline() -> None:
     assert found == pytest.approx({"a": 1.5, "b": 0.5, "all stages": 7 / 13})
 
 
+def test_nodes_are_compared_in_the_order_of_the_graph() -> None:
+    names = [f"stage-{k}" for k in (3, 7, 1, 9, 0, 8, 2, 6, 4, 5)]
+    medians = figures(**dict.fromkeys(names, 1.0))
+    assert list(slower(medians, medians)) == [*names, "all stages"]
+
+
 def test_what_had_no_frame_hides_nothing_that_became_slower() -> None:
     """Of a graph without stages the time of all stages is NaN, which is below any limit."""
     now, before = figures(a=3.0, b=math.nan), figures(a=2.0, b=math.nan)
