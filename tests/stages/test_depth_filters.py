@@ -55,6 +55,16 @@ def test_two_surfaces_are_never_mixed_and_edges_stay(native: type, unit: float) 
     assert (out.depth == left).all()
 
 
+def test_what_sinks_by_less_than_the_gate_is_mixed_with_where_it_was() -> None:
+    stage = FuseDepth(frames=5, gate_mm=4.0)
+    for _ in range(5):
+        stage.process(frame(np.full(SHAPE, 450, np.uint16)))
+    for k in range(1, 6):
+        out = stage.process(frame(np.full(SHAPE, 453, np.uint16)))
+        assert out.depth is not None
+        assert 453 - out.depth == pytest.approx(np.full(SHAPE, 3 * 0.8**k), abs=1e-3)
+
+
 def test_holes_are_filled_for_a_while() -> None:
     stage = FuseDepth(frames=3)
     whole, hole = np.full(SHAPE, 500, np.uint16), np.full(SHAPE, 500, np.uint16)
