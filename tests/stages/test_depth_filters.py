@@ -33,19 +33,6 @@ def test_noise_falls_by_the_root_of_the_number_of_frames() -> None:
     assert out.depth.mean() == pytest.approx(4000, abs=0.5)
 
 
-def test_a_step_that_the_gate_lets_pass_fades() -> None:
-    stage = FuseDepth(frames=5)
-    stage.open()
-    for _ in range(5):
-        stage.process(frame(np.full(SHAPE, 500, np.uint16)))
-    left = []
-    for _ in range(10):
-        depth = stage.process(frame(np.full(SHAPE, 503, np.uint16))).depth
-        assert depth is not None
-        left.append((503 - depth[0, 0]) / 3)
-    assert left == pytest.approx([0.8**k for k in range(1, 11)], rel=1e-3)
-
-
 @pytest.mark.parametrize("z", [0.4, 0.95, 1.5, 3.0])
 def test_noise_as_it_is_at_a_distance_starts_no_pixel_anew(z: float) -> None:
     rng, stage = np.random.default_rng(0), FuseDepth(frames=5)
@@ -66,6 +53,16 @@ def test_two_surfaces_are_never_mixed_and_edges_stay(native: type, unit: float) 
         out = stage.process(frame(left if k % 2 else right, unit))
         assert set(np.unique(out.depth)) == set(np.unique(left))
     assert (out.depth == left).all()
+
+
+def test_what_sinks_by_less_than_the_gate_is_mixed_with_where_it_was() -> None:
+    stage = FuseDepth(frames=5, gate_mm=4.0)
+    for _ in range(5):
+        stage.process(frame(np.full(SHAPE, 450, np.uint16)))
+    for k in range(1, 6):
+        out = stage.process(frame(np.full(SHAPE, 453, np.uint16)))
+        assert out.depth is not None
+        assert 453 - out.depth == pytest.approx(np.full(SHAPE, 3 * 0.8**k), abs=1e-3)
 
 
 def test_holes_are_filled_for_a_while() -> None:
