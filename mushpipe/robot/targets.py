@@ -6,6 +6,7 @@ finite. What is unknown and not needed (orientation, diameter, sigmas) leaves as
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -96,13 +97,26 @@ class Filter:
     def __init__(self, allow_estimated: bool = False, workspace: Workspace | None = None) -> None:
         self._allow_estimated = allow_estimated
         self._workspace = workspace
+        self._picks = 0
+        self._withheld: Counter[Reason] = Counter()
 
     def __call__(self, picks: Picks) -> Choice:
         """Return what may be sent of one frame's picks."""
         oriented = _oriented(picks)
         with np.errstate(all="ignore"):
             left, withheld = self._sieve(picks, oriented)
+            self._picks += len(picks)
+            self._withheld.update(withheld)
             return Choice(picks.frame_id, _targets(picks, oriented, left), withheld)
+
+    def summary(self) -> str:
+        """Return how many of all picks so far were withheld, and why; empty if none was."""
+        reasons = ", ".join(f"{n} '{reason}'" for reason, n in self._withheld.items() if n)
+        if not reasons:
+            return ""
+        text = f"{self._withheld.total()} of {self._picks} mushrooms in all frames were withheld"
+        hint = " ('allow_estimated: true' sends those)" if self._withheld["estimated"] else ""
+        return f"{text} from robots: {reasons}{hint}"
 
     def _sieve(self, picks: Picks, oriented: Bools) -> tuple[Rows, dict[Reason, int]]:
         bad: dict[Reason, Bools] = {

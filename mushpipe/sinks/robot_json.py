@@ -265,7 +265,10 @@ class RobotJsonSink(Sink):
         self._ending = endings.get(code, "failed")
 
     def close(self) -> None:
-        """Take leave of the robots."""
+        """Take leave of the robots, and say what they were not told of."""
+        if self._filter is not None and (withheld := self._filter.summary()):
+            logger.warning(withheld)
+        self._filter = None
         if self._server is not None:
             self._server.stop(self._ending)
             self._server = None

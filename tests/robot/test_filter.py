@@ -55,6 +55,20 @@ def test_a_guessed_depth_is_withheld_unless_allowed() -> None:
     ]
 
 
+def test_a_summary_tells_what_was_withheld_in_all_frames() -> None:
+    picked = Filter()
+    assert picked.summary() == ""
+    picked(make_picks(3))
+    assert picked.summary() == ""
+    picked(make_picks(3, source=[1, 2, 2]))
+    position, flags = [[NAN] * 3, [0, 0, 0.5]], [PickFlag.DEPTH_MISSING, 0]
+    picked(make_picks(2, position=position, source=[0, 2], flags=flags))
+    assert picked.summary() == (
+        "4 of 8 mushrooms in all frames were withheld from robots: 1 'no_depth', 3 'estimated' "
+        "('allow_estimated: true' sends those)"
+    )
+
+
 def test_a_guess_whose_flag_was_forgotten_is_still_a_guess() -> None:
     assert ids(Filter()(make_picks(2, source=[2, 1]))) == [1]
 

@@ -78,6 +78,18 @@ def ages(sink: RobotJsonSink, *frame: Any) -> int | None:
     return sink._server.hub.age_ms(sink._clock.monotonic())
 
 
+def test_the_last_word_of_a_run_is_what_robots_were_not_told_of(
+    sink: RobotJsonSink, caplog: pytest.LogCaptureFixture
+) -> None:
+    sink.open(LIVE)
+    picks = make_picks(3, source=[1, 2, 1])
+    for _ in range(2):
+        sink.consume(picks, Trace(frame_at(EPOCH_NS), {}, {}, NOW_NS))
+    sink.close()
+    sink.close()
+    assert caplog.text.count("2 of 6 mushrooms in all frames were withheld from robots: 2") == 1
+
+
 def test_a_recording_is_not_served_unless_the_graph_says_so(sink: RobotJsonSink) -> None:
     with pytest.raises(UsageError, match="replay: true"):
         sink.open(RunInfo("test", {}))
