@@ -127,16 +127,10 @@ def _farthest_image(coefficients: tuple[float, ...]) -> float:
     fold = _fold(coefficients)
     if not np.isfinite(fold):
         return np.inf
-    reach = np.sqrt(fold)
-    radial = np.linspace(0, reach, 100)
-    image = brown(np.column_stack([radial, 0 * radial]), _without_tangential(coefficients))
+    reach = np.linspace(0, np.sqrt(fold), 100)
+    image = reach * _radial(reach**2, coefficients)[0]
     tangential = 3 * (abs(coefficients[2]) + abs(coefficients[3])) * fold
     return float(1.01 * np.abs(image).max() + tangential)
-
-
-def _without_tangential(coefficients: tuple[float, ...]) -> tuple[float, ...]:
-    k1, k2, _, _, *rest = coefficients
-    return k1, k2, 0.0, 0.0, *rest
 
 
 @cache
