@@ -180,8 +180,7 @@ def encode_camera(camera: Camera | None, size: tuple[int, ...], header: Header) 
     return Message("", foxglove_schema("CameraCalibration"), message.encode())
 
 
-def _encode_frame(frame: RgbdFrame, header: Header) -> Iterator[Message]:
-    del header
+def _encode_frame(frame: RgbdFrame, _: Header) -> Iterator[Message]:
     yield encode_color(frame)._replace(suffix="/color")
     if frame.depth is not None:
         yield encode_depth(frame)._replace(suffix="/depth")
