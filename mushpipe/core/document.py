@@ -37,7 +37,7 @@ _Loader.add_implicit_resolver(
 
 @dataclass
 class Document:
-    """The data of a graph file; ``marks`` gives (line, column) of each key and value, from 1."""
+    """The data of a graph file; ``keys`` and ``values`` give line and column of each, from 1."""
 
     file: str
     base: Path

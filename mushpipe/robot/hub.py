@@ -201,11 +201,11 @@ class Hub:
         """Return the targets nobody has claimed, best first."""
         choice = result.choice
         self._places.look(choice, self.ledger.claimed())
-        unnamed = (t for t in choice.targets if not self.ledger.hides(t.id))
-        return [t for t in unnamed if not self._places.taken(t, choice.frame)]
+        shown = (t for t in choice.targets if not self.ledger.hides(t.id))
+        return [t for t in shown if not self._places.taken(t, choice.frame)]
 
     def offered(self, result: Result) -> list[Target]:
-        """Return the first of them, as many as may be sent."""
+        """Return the first targets nobody has claimed, as many as may be sent."""
         return self.free(result)[: self.settings.max_targets]
 
     def _body(self, result: Result, most: int) -> tuple[bytes, dict[Reason, int], bool]:
