@@ -6,7 +6,7 @@ import faulthandler
 import json
 import logging
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict
 from enum import StrEnum
 from importlib.metadata import version
@@ -94,19 +94,16 @@ def _program(
     del asked  # `_version` has looked at it
 
 
-def _compile(
-    graph: Path, overrides: list[Any], source: str | None, more_sinks: Sequence[str] = ()
-) -> Plan:
+def _compile(graph: Path, overrides: list[Any], source: str | None, foxglove: bool = False) -> Plan:
     from mushpipe.core.capsule import capsule_document
     from mushpipe.core.document import read_document
     from mushpipe.core.graph import compile_document
     from mushpipe.core.plugins import load_registry
 
     document = capsule_document(graph) if graph.suffix.lower() == ".mcap" else read_document(graph)
-    for name in more_sinks:
-        sinks = document.data.get("sinks") or {}
-        if isinstance(sinks, dict):
-            document.data["sinks"] = {name: {"use": name}, **sinks}
+    sinks = document.data.get("sinks") or {}
+    if foxglove and isinstance(sinks, dict):
+        document.data["sinks"] = {"foxglove": {"use": "foxglove"}, **sinks}
     plan = compile_document(document, load_registry(), overrides, source)
     for warning in plan.warnings:
         logger.warning(warning)
@@ -136,8 +133,7 @@ def run(
 
     set_up_logging(verbose)
     flags = source_overrides(frames=frames, start=start, end=end, speed=speed, loop=loop)
-    more = ["foxglove"] if foxglove else []
-    plan = _compile(graph, [*flags, *(set_ or [])], source, more)
+    plan = _compile(graph, [*flags, *(set_ or [])], source, foxglove)
     repeated = graph.suffix.lower() == ".mcap" and source is None  # its frame is saved already
     beside = manifest_of(graph) if repeated else manifest_path(plan)
     report = execute(plan, manifest or beside, None if repeated else capsules)

@@ -78,7 +78,6 @@ def brown_inverse(xy: Floats, coefficients: tuple[float, ...]) -> Floats:
 
 def _block_inverse(wanted: Floats, coefficients: tuple[float, ...]) -> Floats:
     """Undo `brown` for points (N, 2)."""
-    fold = _fold(coefficients)
     wanted_x, wanted_y = np.ascontiguousarray(wanted.T)
     x, y = wanted_x.copy(), wanted_y.copy()
     with np.errstate(all="ignore"):
@@ -99,7 +98,7 @@ def _block_inverse(wanted: Floats, coefficients: tuple[float, ...]) -> Floats:
             y[left] -= dy[going]
         guess = np.column_stack([x, y])
         bad = ~(np.abs(brown(guess, coefficients) - wanted).max(axis=-1) < 1e-7)
-        bad |= (guess**2).sum(axis=-1) >= fold
+        bad |= (guess**2).sum(axis=-1) >= _fold(coefficients)
     guess[bad] = np.nan
     return guess
 
