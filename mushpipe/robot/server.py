@@ -210,7 +210,6 @@ class RobotServer:
             client.serve()
         except Exception:  # a fault met with one client must not cost the others theirs
             logger.exception("robot client %d: internal error; it is disconnected", client.number)
-            self._unregister(client)
             client.abort("internal error")
         if client.gone:
             self._unregister(client)
