@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import faulthandler
 import json
+import logging
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from dataclasses import asdict
 from enum import StrEnum
 from importlib.metadata import version
 from pathlib import Path
@@ -13,6 +15,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mushpipe.core.closed import open_closed
+from mushpipe.core.errors import EXIT_DAMAGED, EXIT_INTERRUPTED, GraphError, MushpipeError
+from mushpipe.core.interrupt import watch
+from mushpipe.core.overwriting import require_writable, write_text
 from mushpipe.doctor import register as register_doctor
 from mushpipe.evaluate.cli import register as register_eval
 from mushpipe.options import file_argument, source_overrides
@@ -25,6 +31,7 @@ from mushpipe.viewing import register as register_viewing
 if TYPE_CHECKING:
     from mushpipe.core.plan import Plan
 
+logger = logging.getLogger("mushpipe")
 app = typer.Typer(
     help="RGB-D camera above a mushroom bed in, pick targets for a robot out.\n\n"
     "mushpipe run graphs/demo.yaml\n\n"
@@ -87,24 +94,19 @@ def _program(
     del asked  # `_version` has looked at it
 
 
-def _compile(
-    graph: Path, overrides: list[Any], source: str | None, more_sinks: Sequence[str] = ()
-) -> Plan:
-    import logging
-
+def _compile(graph: Path, overrides: list[Any], source: str | None, foxglove: bool = False) -> Plan:
     from mushpipe.core.capsule import capsule_document
     from mushpipe.core.document import read_document
     from mushpipe.core.graph import compile_document
     from mushpipe.core.plugins import load_registry
 
     document = capsule_document(graph) if graph.suffix.lower() == ".mcap" else read_document(graph)
-    for name in more_sinks:
-        sinks = document.data.get("sinks") or {}
-        if isinstance(sinks, dict):
-            document.data["sinks"] = {name: {"use": name}, **sinks}
+    sinks = document.data.get("sinks") or {}
+    if foxglove and isinstance(sinks, dict):
+        document.data["sinks"] = {"foxglove": {"use": "foxglove"}, **sinks}
     plan = compile_document(document, load_registry(), overrides, source)
     for warning in plan.warnings:
-        logging.getLogger("mushpipe").warning(warning)
+        logger.warning(warning)
     return plan
 
 
@@ -131,8 +133,7 @@ def run(
 
     set_up_logging(verbose)
     flags = source_overrides(frames=frames, start=start, end=end, speed=speed, loop=loop)
-    more = ["foxglove"] if foxglove else []
-    plan = _compile(graph, [*flags, *(set_ or [])], source, more)
+    plan = _compile(graph, [*flags, *(set_ or [])], source, foxglove)
     repeated = graph.suffix.lower() == ".mcap" and source is None  # its frame is saved already
     beside = manifest_of(graph) if repeated else manifest_path(plan)
     report = execute(plan, manifest or beside, None if repeated else capsules)
@@ -149,11 +150,7 @@ def validate(
     output: OutputOption = Output.text,
 ) -> None:
     """Check a graph file without running it; report every fault at once."""
-    import logging
-    from dataclasses import asdict
-
     from mushpipe.console import set_up_logging
-    from mushpipe.core.errors import GraphError
 
     set_up_logging(False)
     try:
@@ -165,7 +162,7 @@ def validate(
         raise
     missing = plan.missing_files()  # which another machine may have
     for text in missing:
-        logging.getLogger("mushpipe").warning(text)
+        logger.warning(text)
     if output is Output.json:
         warnings = [*plan.warnings, *missing]
         _out(json.dumps({"problems": [], "warnings": warnings, "graph": plan.resolved()}))
@@ -203,7 +200,7 @@ def info(
 
     content = describe(file)
     _out(json.dumps(content) if output is Output.json else render(content))
-    raise typer.Exit(4 if content["damage"] else 0)
+    raise typer.Exit(EXIT_DAMAGED if content["damage"] else 0)
 
 
 @app.command()
@@ -225,7 +222,6 @@ def schema(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="file to write")] = None,
 ) -> None:
     """Print the JSON Schema of graph files, for completion in an editor."""
-    from mushpipe.core.overwriting import require_writable, write_text
     from mushpipe.core.plugins import load_registry
     from mushpipe.core.schema import graph_schema
 
@@ -270,12 +266,6 @@ register_proof(app)
 
 def main() -> None:
     """Entry point: errors meant for the user become one message and an exit code."""
-    import logging
-
-    from mushpipe.core.closed import open_closed
-    from mushpipe.core.errors import EXIT_INTERRUPTED, MushpipeError
-    from mushpipe.core.interrupt import watch
-
     open_closed()
     if logging.lastResort:  # of the verbs that set up no log: what they warn of is called a warning
         logging.lastResort.setFormatter(logging.Formatter("%(levelname)s: %(message)s"))

@@ -136,7 +136,7 @@ def progress_bar(size: Callable[[], int] | None = None) -> Iterator[Any]:
 def execute(
     plan: Plan, manifest: Path | None, capsules: Path | None, size: Callable[[], int] | None = None
 ) -> RunReport:
-    """Run a plan in front of a user; no ``manifest`` or ``capsules`` where None, ``size`` above."""
+    """Run a plan in front of a user; None writes no manifest, no capsules; see `progress_bar`."""
     spare(manifest, *files_read(plan))
     require_writable(manifest, with_folder=True)
     stop = threading.Event()

@@ -19,6 +19,7 @@ from typing import Annotated
 
 import typer
 
+from mushpipe.core.errors import EXIT_FAILED, EXIT_NO_DEVICE, EXIT_OK, DependencyError
 from mushpipe.output import Output, OutputOption
 
 _PACKAGES = ("mushpipe", "numpy", "opencv-python-headless", "scipy", "numba", "mcap", "rerun-sdk")
@@ -64,8 +65,6 @@ def doctor(
     output: OutputOption = Output.text,
 ) -> None:
     """Look at this computer, its libraries and its cameras; say what is wrong and what to do."""
-    from mushpipe.core.errors import EXIT_FAILED, EXIT_NO_DEVICE, EXIT_OK
-
     findings = [*_python(), *_libraries(), *_plugins(), *_kernels(), *_disk(folder)]
     failed = any(finding.state is State.error for finding in findings)
     cameras = list(_cameras())
@@ -89,7 +88,6 @@ def _python() -> Iterator[Finding]:
 
 
 def _libraries() -> Iterator[Finding]:
-    from mushpipe.core.errors import DependencyError
     from mushpipe.core.libraries import import_onnxruntime, import_open3d, import_realsense
 
     native = {
@@ -182,7 +180,6 @@ def _write_speed(folder: Path) -> float:
 
 
 def _cameras() -> Iterator[Finding]:
-    from mushpipe.core.errors import DependencyError
     from mushpipe.core.libraries import import_realsense
     from mushpipe.sources.realsense_device import info
 

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import logging
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mushpipe.core.errors import UsageError
+from mushpipe.core.paths import STDIO
 from mushpipe.options import source_overrides
 
 if TYPE_CHECKING:
     from mushpipe.core.plan import Plan
     from mushpipe.core.report import RunReport
 
+logger = logging.getLogger("mushpipe")
 JPEG_QUALITY = 90
 
 
@@ -57,10 +61,7 @@ def record(
     split_size: SplitOption = None,
 ) -> None:
     """Record a source until it ends or Ctrl-C; what cannot be kept is counted and told."""
-    import logging
-
     from mushpipe.console import execute, set_up_logging
-    from mushpipe.core.paths import STDIO
 
     set_up_logging(False)
     limits = source_overrides(frames=frames, duration=duration)
@@ -72,7 +73,7 @@ def record(
     settings |= {"split_size": split_size} if split_size is not None else {}
     plan = _compile(settings, [*limits, *(set_ or [])], source)
     for text in plan.warnings:
-        logging.getLogger("mushpipe").warning(text)
+        logger.warning(text)
     _refuse_to_overwrite(plan)
     size = None if out == STDIO else lambda: sum(path.stat().st_size for path in _files(plan))
     report = execute(plan, None, Path("failures"), size)
@@ -106,7 +107,6 @@ def _files(plan: Plan) -> list[Path]:
 
 
 def _refuse_to_overwrite(plan: Plan) -> None:
-    from mushpipe.core.errors import UsageError
     from mushpipe.core.recorder import EXISTS
 
     for path in _files(plan):

@@ -13,7 +13,7 @@ import numpy as np
 
 from mushpipe.core.chain import Chain, called
 from mushpipe.core.document import read_document
-from mushpipe.core.edges import failure, limited, named, opened, opener
+from mushpipe.core.edges import failure, limited, named, opened
 from mushpipe.core.errors import PluginError
 from mushpipe.core.graph import compile_document
 from mushpipe.core.plan import Node, Plan
@@ -70,7 +70,7 @@ def _result(node: Node, arguments: dict[str, Any]) -> tuple[Any, ...]:
     frame = next((v for v in arguments.values() if isinstance(v, RgbdFrame)), None)
     if node.ports.rng is not None:
         arguments = arguments | {node.ports.rng: np.random.default_rng(0)}
-    with opened(node, opener(node)):
+    with opened(node):
         try:
             return called(node, arguments, frame)
         except (Exception, SystemExit) as error:
@@ -116,7 +116,7 @@ def _traces(plan: Plan) -> Iterator[Trace]:
         raise TypeError("the plan's source is not a Source")
     with ExitStack() as stack:
         for node in (plan.source, *plan.stages):
-            stack.enter_context(opened(node, opener(node)))
+            stack.enter_context(opened(node))
         stack.enter_context(named(plan.source, "frames"))
         for ticket, frame in enumerate(limited(source.frames(), source)):
             left_ns = time.perf_counter_ns()

@@ -21,14 +21,7 @@ from mushpipe.core.manifest import sha256
 from mushpipe.core.recording import MANIFEST, Index, Raw, RecordingReader
 from mushpipe.core.settings import told
 from mushpipe.core.types import Header, Mask, RgbdFrame, Trace
-from mushpipe.core.wire import (
-    COLOR_TOPIC,
-    NO_DEPTH,
-    RESULT_PREFIX,
-    TABLES,
-    TIMING_TOPIC,
-    decode_table,
-)
+from mushpipe.core.wire import COLOR_TOPIC, NO_DEPTH, RESULT_PREFIX, TIMING_TOPIC, decode_table
 
 _PARTS = ("initial", "color", "depth")  # images of an output, each on a topic of its own
 LOST = 256  # results of so many frames without images are kept, in case those come later
@@ -198,9 +191,8 @@ def _trace(frame: RgbdFrame, messages: list[Raw], order: list[str]) -> Trace:
         schema = raw.schema.name if raw.schema else ""
         if raw.channel.topic == TIMING_TOPIC:
             durations = stage_times(raw.message.data)
-        elif raw.table in TABLES:
-            decoded = decode_table(raw.table, raw.message.data)
-            outputs[stage] = (*outputs.get(stage, ()), decoded.table if decoded else None)
+        elif (decoded := decode_table(raw.table, raw.message.data)) is not None:
+            outputs[stage] = (*outputs.get(stage, ()), decoded.table)
         elif schema == "foxglove.RawImage" and (image := _image(raw)) is not None:
             # what is not a stage's first output stands below its type
             name = part.rpartition("/")[2]

@@ -9,7 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from pydantic import ValidationError
 
+from mushpipe.core.errors import EXIT_INTERRUPTED, DependencyError, MushpipeError, UsageError
+from mushpipe.core.overwriting import require_writable, spare
+from mushpipe.core.stage import RunInfo
 from mushpipe.options import file_argument
 
 if TYPE_CHECKING:
@@ -48,8 +52,6 @@ def figure(
 ) -> None:
     """Draw a figure of the paper from a frame of a result recording."""
     from mushpipe.console import set_up_logging
-    from mushpipe.core.errors import MushpipeError, UsageError
-    from mushpipe.core.overwriting import require_writable, spare
     from mushpipe.figure import KINDS
     from mushpipe.figure_pose import draw_pose
     from mushpipe.sinks.rerun_clouds import write_clouds
@@ -106,11 +108,7 @@ def view(
     ] = None,
 ) -> None:
     """Open a recording or results in the Rerun viewer."""
-    from pydantic import ValidationError
-
     from mushpipe.console import interruptible, set_up_logging
-    from mushpipe.core.errors import DependencyError, UsageError
-    from mushpipe.core.overwriting import spare
     from mushpipe.core.recording import RecordingReader
     from mushpipe.sinks.rerun import RerunSink
     from mushpipe.sinks.rerun_server import has_display
@@ -142,7 +140,6 @@ def view(
 def _source_settings(file: Path, overrides: list[str]) -> dict[str, Any]:
     """Return the settings of the source that the command line gives."""
     from mushpipe.core.document import Document
-    from mushpipe.core.errors import UsageError
     from mushpipe.core.graph import compile_document
     from mushpipe.core.plugins import load_registry
 
@@ -157,9 +154,7 @@ def _source_settings(file: Path, overrides: list[str]) -> dict[str, Any]:
 
 def _play(file: Path, played: dict[str, Any], sink: RerunSink, stop: threading.Event) -> None:
     from mushpipe.console import progress_bar
-    from mushpipe.core.errors import EXIT_INTERRUPTED
     from mushpipe.core.report import RunReport
-    from mushpipe.core.stage import RunInfo
     from mushpipe.traces import read_manifest, read_traces
 
     report, traces = RunReport(), read_traces(file, played)

@@ -1,4 +1,4 @@
-"""Arrays by the type of their elements, what shape one has stands in docstrings; and their lock."""
+"""Names for arrays by the type of their elements, and how one is made read-only."""
 
 from __future__ import annotations
 

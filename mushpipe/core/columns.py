@@ -63,7 +63,7 @@ class Columns:
         """
 
     def check_rows(self) -> None:
-        """Raise ValueError where rows contradict each other; likewise, and always checked."""
+        """Raise ValueError where rows contradict each other; also of rows taken or joined."""
 
     @classmethod
     @cache

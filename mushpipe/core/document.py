@@ -37,7 +37,7 @@ _Loader.add_implicit_resolver(
 
 @dataclass
 class Document:
-    """The data of a graph file; ``marks`` gives (line, column) of each key and value, from 1."""
+    """The data of a graph file; ``keys`` and ``values`` give line and column of each, from 1."""
 
     file: str
     base: Path
@@ -176,31 +176,20 @@ class _Builder:
         return self._scalar(node, tag, at)
 
     def _pairs(self, node: yaml.MappingNode, at: Location) -> Iterator[tuple[str, Any]]:
-        seen: set[str] = set()
         for key_node, value_node in node.value:
             key = key_node.value if isinstance(key_node, yaml.ScalarNode) else "?"
+            place = (*at, key)
             mark = (key_node.start_mark.line + 1, key_node.start_mark.column + 1)
             if key_node.tag.endswith(":merge"):
                 text, hint = "a merge key (<<) is not known here", "write the settings out"
-                excerpt = self.document._excerpt(mark[0])
-                self.problems.append(Problem(self.document.file, *mark, text, hint, excerpt))
+            elif first := self.document.keys.get(place):
+                text, hint = f"the key '{key}' stands twice", f"it stands first in line {first[0]}"
+            else:
+                self.document.keys[place] = mark
+                yield key, self.build(value_node, place)
                 continue
-            if key in seen:
-                line, column = mark
-                self.problems.append(
-                    Problem(
-                        self.document.file,
-                        line,
-                        column,
-                        f"the key '{key}' stands twice",
-                        f"it stands first in line {self.document.keys[(*at, key)][0]}",
-                        self.document._excerpt(line),
-                    )
-                )
-                continue
-            seen.add(key)
-            self.document.keys[(*at, key)] = mark
-            yield key, self.build(value_node, (*at, key))
+            excerpt = self.document._excerpt(mark[0])
+            self.problems.append(Problem(self.document.file, *mark, text, hint, excerpt))
 
     def _scalar(self, node: yaml.Node, tag: str, at: Location) -> Any:
         if tag == "timestamp":

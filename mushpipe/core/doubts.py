@@ -23,7 +23,7 @@ OFF_CENTRE = 1 / 6  # share of the image; of cropped images alone principal poin
 ALIKE = 0.1  # shares, or ratios, that differ by less are the same
 # A `bow`: of beds in z it is 0.4 at most, of the same in ranges nearly always 0.75 to 1.4.
 BOWED, MOST_BOWED = 0.6, 1.6
-NARROW = 0.03  # by so much longer, at the border, a narrow view's ranges are no bowl to be seen
+NARROW = 0.03  # where rays at the border are longer by less, ranges make no bowl that could be seen
 STILL = 30  # frames
 _APART = 16  # px between those that are compared first
 _FEWEST_POINTS, _MOST_POINTS = 500, 5000

@@ -7,7 +7,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from itertools import islice
 from typing import Any
@@ -19,7 +19,7 @@ from mushpipe.core.plan import Node
 from mushpipe.core.plugins import prints_aside
 from mushpipe.core.recorder import RecordingError
 from mushpipe.core.report import Durations, SinkReport
-from mushpipe.core.stage import Plugin, ReplaySource, RunInfo, Sink, Source, Stage
+from mushpipe.core.stage import ReplaySource, RunInfo, Sink, Source, Stage
 from mushpipe.core.types import RgbdFrame
 
 logger = logging.getLogger("mushpipe")
@@ -127,29 +127,25 @@ def interruptible_opening(source: Source, stop: threading.Event) -> Iterator[Non
         watcher.join()
 
 
-def opener(node: Node, info: RunInfo | None = None) -> Callable[[], None]:
-    """Return what opens a node for a run."""
-    plugin = node.plugin
-    if isinstance(plugin, Sink) and info is not None:
-        return lambda: plugin.open(info)
-    return plugin.open if isinstance(plugin, Stage | Source) else lambda: None
-
-
 @contextmanager
-def opened(node: Node, opener: Callable[[], None]) -> Iterator[Plugin]:
-    """Open a node, and close it on leaving, whether or not that worked."""
+def opened(node: Node, info: RunInfo | None = None) -> Iterator[None]:
+    """Open a node for a run, and close it on leaving, whether or not that worked."""
+    plugin = node.plugin
     try:
         # a sink may open standard output itself
         aside = nullcontext() if node.kind == "sink" else prints_aside()
         with named(node, "open"), aside:
-            opener()
-        yield node.plugin
+            if isinstance(plugin, Stage | Source):
+                plugin.open()
+            elif isinstance(plugin, Sink) and info is not None:
+                plugin.open(info)
+        yield
     except BaseException:
         with suppress(Exception, SystemExit):  # the first error is the one to report
-            node.plugin.close()
+            plugin.close()
         raise
     with named(node, "close"):
-        node.plugin.close()
+        plugin.close()
 
 
 class SourceThread(threading.Thread):

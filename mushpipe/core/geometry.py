@@ -78,7 +78,6 @@ def brown_inverse(xy: Floats, coefficients: tuple[float, ...]) -> Floats:
 
 def _block_inverse(wanted: Floats, coefficients: tuple[float, ...]) -> Floats:
     """Undo `brown` for points (N, 2)."""
-    fold = _fold(coefficients)
     wanted_x, wanted_y = np.ascontiguousarray(wanted.T)
     x, y = wanted_x.copy(), wanted_y.copy()
     with np.errstate(all="ignore"):
@@ -99,7 +98,7 @@ def _block_inverse(wanted: Floats, coefficients: tuple[float, ...]) -> Floats:
             y[left] -= dy[going]
         guess = np.column_stack([x, y])
         bad = ~(np.abs(brown(guess, coefficients) - wanted).max(axis=-1) < 1e-7)
-        bad |= (guess**2).sum(axis=-1) >= fold
+        bad |= (guess**2).sum(axis=-1) >= _fold(coefficients)
     guess[bad] = np.nan
     return guess
 
@@ -127,16 +126,10 @@ def _farthest_image(coefficients: tuple[float, ...]) -> float:
     fold = _fold(coefficients)
     if not np.isfinite(fold):
         return np.inf
-    reach = np.sqrt(fold)
-    radial = np.linspace(0, reach, 100)
-    image = brown(np.column_stack([radial, 0 * radial]), _without_tangential(coefficients))
+    reach = np.linspace(0, np.sqrt(fold), 100)
+    image = reach * _radial(reach**2, coefficients)[0]
     tangential = 3 * (abs(coefficients[2]) + abs(coefficients[3])) * fold
     return float(1.01 * np.abs(image).max() + tangential)
-
-
-def _without_tangential(coefficients: tuple[float, ...]) -> tuple[float, ...]:
-    k1, k2, _, _, *rest = coefficients
-    return k1, k2, 0.0, 0.0, *rest
 
 
 @cache

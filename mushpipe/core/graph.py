@@ -21,13 +21,7 @@ from mushpipe.core.paths import IMAGES, from_home, real
 from mushpipe.core.plan import Node, Plan
 from mushpipe.core.plugins import Registry, in_file
 from mushpipe.core.ports import OF_SOURCE, ports_of
-from mushpipe.core.settings import (
-    WORDS,
-    default_paths,
-    read_settings,
-    settings_of,
-    writing_fault,
-)
+from mushpipe.core.settings import WORDS, default_paths, read_settings, settings_of, writing_fault
 from mushpipe.core.stage import Kind, Plugin, RunInfo, Source
 from mushpipe.core.transform import Transform
 from mushpipe.core.wire import BASE_TOPIC, RESULT_PREFIX, TIMING_TOPIC, TOTAL

@@ -16,7 +16,7 @@ from mushpipe.core.errors import EXIT_INTERRUPTED
 
 
 class _Interrupted(KeyboardInterrupt):
-    """Of the base itself Python would die, where it once left an `exec` (of a dataclass, say)."""
+    """Python itself dies of a plain one that has left an `exec` (of a dataclass, say) before."""
 
 
 def _say(number: int) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import importlib
 import re
+from contextlib import suppress
 from typing import Any
 
 from mushpipe.core.errors import DependencyError
@@ -51,11 +52,10 @@ def import_onnxruntime() -> Any:
 
 
 def _load_libusb() -> None:
-    try:
+    # the system may have its own libusb; if not, the import that needs it says so
+    with suppress(ImportError, OSError):
         library = importlib.import_module("libusb_package").get_library_path()
         ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
-    except (ImportError, OSError):
-        pass  # the system may have its own libusb; if not, the import that needs it says so
 
 
 def _import(name: str) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -154,15 +155,12 @@ class RecordingReader:
         of the file within a chunk.
         """
         index, seen = self.index(), 0
+        end = math.inf if end_ns is None else end_ns
         # A chunk that is skipped or corrupt may be the one that declares them.
         channels, schemas = dict(index.by_id), dict(index.schemas)
 
-        def wanted(time: int) -> bool:
-            return time >= start_ns and (end_ns is None or time < end_ns)
-
         def overlaps(chunk: Chunk | ChunkIndex) -> bool:
-            past = end_ns is not None and chunk.message_start_time >= end_ns
-            return chunk.message_end_time >= start_ns and not past
+            return chunk.message_end_time >= start_ns and chunk.message_start_time < end
 
         turned = bool(index.side_by_side)  # mushpipe leaves none: another program wrote it anew
         records = self._by_log_time(overlaps) if turned else self._records(overlaps, as_written)
@@ -174,9 +172,10 @@ class RecordingReader:
             elif isinstance(record, McapMessage):
                 seen += 1
                 channel = channels.get(record.channel_id)
+                inside = start_ns <= record.log_time < end
                 if channel is None:
                     self._note("a message belongs to no channel")
-                elif wanted(record.log_time) and (topics is None or channel.topic in topics):
+                elif inside and (topics is None or channel.topic in topics):
                     yield Raw(channel, schemas.get(channel.schema_id), record)
         if not start_ns and end_ns is None and seen < index.counts.total() and not self.damage:
             self._note(f"{index.counts.total() - seen} of its messages are missing")

@@ -19,7 +19,6 @@ from mushpipe.core.edges import (
     interruptible_opening,
     named,
     opened,
-    opener,
     plain,
 )
 from mushpipe.core.errors import InputError, MushpipeError, StageError
@@ -97,7 +96,7 @@ class _Runner:
             self.report.manifest = build_manifest(self.plan)
         with ExitStack() as stack:
             with interruptible_opening(source, self.stop):
-                stack.enter_context(opened(self.plan.source, opener(self.plan.source)))
+                stack.enter_context(opened(self.plan.source))
             durations = self.report.durations[self.plan.source.name]
             with named(self.plan.source, "live"):
                 self.reader = SourceThread(self.plan.source, source, threading.Event(), durations)
@@ -107,7 +106,7 @@ class _Runner:
             # Who writes a file empties it: not before all that may fail without has opened.
             sinks = sorted(self.plan.sinks, key=lambda node: bool(written[node.name]))
             for node in (*self.plan.stages, *sinks):
-                stack.enter_context(opened(node, opener(node, info)))
+                stack.enter_context(opened(node, info))
             self.report.files = tuple(path for paths in written.values() for path in paths)
             self.report.opened = True
             self.started = time.monotonic()  # what opening took is no part of the frames' pace

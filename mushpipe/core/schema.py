@@ -18,9 +18,8 @@ def graph_schema(registry: Registry) -> dict[str, Any]:
     properties = schema["properties"]
     definitions: dict[str, Any] = {}
     properties["source"] |= _one_of(registry, "source", definitions)
-    for key, kind in (("stages", "stage"), ("sinks", "sink")):
-        choice = _one_of(registry, kind, definitions)  # type: ignore[arg-type]
-        properties[key]["additionalProperties"] = choice
+    properties["stages"]["additionalProperties"] = _one_of(registry, "stage", definitions)
+    properties["sinks"]["additionalProperties"] = _one_of(registry, "sink", definitions)
     return {
         **schema,
         "$schema": "https://json-schema.org/draft/2020-12/schema",

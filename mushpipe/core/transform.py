@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import (
-    BeforeValidator,
-    Field,
-    ValidationError,
-    ValidationInfo,
-    field_validator,
-)
+from pydantic import BeforeValidator, Field, ValidationError, ValidationInfo, field_validator
 
 from mushpipe.core.arrays import Floats
+from mushpipe.core.document import read_document
+from mushpipe.core.errors import GraphError
 from mushpipe.core.group import Group
 from mushpipe.core.paths import resolve_path
 from mushpipe.core.settings import told
@@ -116,11 +113,6 @@ def _read(value: Any, info: ValidationInfo) -> Any:
         raise ValueError(f"it is a list, or matrix; expected {_EXPECTED}, or a YAML file of these")
     if not isinstance(value, str):
         return value
-    import json
-
-    from mushpipe.core.document import read_document
-    from mushpipe.core.errors import GraphError
-
     path = resolve_path(Path(value), info)
     try:
         data = read_document(path, "frame: robot_base").data

@@ -95,11 +95,11 @@ def timestamp(stamp_ns: int) -> Any:
     return Timestamp(sec=stamp_ns // 10**9, nsec=stamp_ns % 10**9)
 
 
-def encode_image(image: np.ndarray[Any, Any], encoding: str, header: Header) -> bytes:
+def encode_image(image: np.ndarray[Any, Any], encoding: str, header: Header) -> Message:
     """Encode an (H, W) or (H, W, C) array as foxglove.RawImage."""
     from foxglove.messages import RawImage
 
-    return RawImage(
+    message = RawImage(
         timestamp=timestamp(header.stamp_ns),
         frame_id=header.frame_id,
         width=image.shape[1],
@@ -107,14 +107,14 @@ def encode_image(image: np.ndarray[Any, Any], encoding: str, header: Header) -> 
         encoding=encoding,
         step=image[0].nbytes,
         data=image.tobytes(),
-    ).encode()
+    )
+    return Message("", foxglove_schema("RawImage"), message.encode())
 
 
 def encode_color(frame: RgbdFrame, jpeg_quality: int | None = None) -> Message:
     """Encode the colour image, lossless or as JPEG."""
     if jpeg_quality is None:
-        data = encode_image(frame.color, "rgb8", frame.header)
-        return Message("", foxglove_schema("RawImage"), data)
+        return encode_image(frame.color, "rgb8", frame.header)
     from foxglove.messages import CompressedImage
 
     image = CompressedImage(
@@ -146,9 +146,8 @@ def encode_depth(frame: RgbdFrame) -> Message:
     else:  # RealSense states its scale in single precision
         millimetres = np.float32(frame.depth_scale) == np.float32(0.001)
         encoding = "16UC1" if millimetres else "mono16"
-    data = encode_image(frame.depth, encoding, frame.header)
     metadata = {"depth_scale": repr(float(frame.depth_scale))}
-    return Message("", foxglove_schema("RawImage"), data, metadata)
+    return encode_image(frame.depth, encoding, frame.header)._replace(metadata=metadata)
 
 
 def encode_camera(camera: Camera | None, size: tuple[int, ...], header: Header) -> Message:
@@ -180,8 +179,7 @@ def encode_camera(camera: Camera | None, size: tuple[int, ...], header: Header) 
     return Message("", foxglove_schema("CameraCalibration"), message.encode())
 
 
-def _encode_frame(frame: RgbdFrame, header: Header) -> Iterator[Message]:
-    del header
+def _encode_frame(frame: RgbdFrame, _: Header) -> Iterator[Message]:
     yield encode_color(frame)._replace(suffix="/color")
     if frame.depth is not None:
         yield encode_depth(frame)._replace(suffix="/depth")
@@ -191,13 +189,11 @@ def _encode_mask(mask: Mask, header: Header) -> Iterator[Message]:
     for suffix, image in (("", mask.foreground), ("/initial", mask.initial)):
         if image is not None:
             pixels = image.view(np.uint8) * np.uint8(255)
-            yield Message(
-                suffix, foxglove_schema("RawImage"), encode_image(pixels, "mono8", header)
-            )
+            yield encode_image(pixels, "mono8", header)._replace(suffix=suffix)
 
 
 def _encode_instances(instances: Instances, header: Header) -> Iterator[Message]:
-    yield Message("", foxglove_schema("RawImage"), encode_image(instances.labels, "mono16", header))
+    yield encode_image(instances.labels, "mono16", header)
 
 
 def _encode_table(table: Columns, header: Header) -> Iterator[Message]:

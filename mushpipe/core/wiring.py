@@ -22,7 +22,7 @@ _SHARE = "plugins share a type that they import from one package, or define in o
 
 
 def wire(
-    document: Document, registry: Registry, nodes: list[Node], unknown: Set[str] = frozenset()
+    document: Document, registry: Registry, nodes: list[Node], unknown: Set[str]
 ) -> list[Problem]:
     """Fill the links of all nodes, given source first, then stages, then sinks, in file order.
 

@@ -16,12 +16,13 @@ from pathlib import Path
 from typing import Any
 
 from mushpipe.core.chain import Chain
+from mushpipe.core.edges import opened
 from mushpipe.core.errors import InputError, UsageError
 from mushpipe.core.manifest import build_manifest
 from mushpipe.core.plan import Plan
 from mushpipe.core.report import RunReport
 from mushpipe.core.run import Progress, run
-from mushpipe.core.stage import Source, Stage
+from mushpipe.core.stage import Source
 
 WARM_UP_FRAMES = 3
 TRACED_FRAMES = 5
@@ -149,10 +150,8 @@ def _allocated_mb(plan: Plan) -> float:
     if not isinstance(source, Source):
         raise TypeError("the plan's source is not a Source")
     with ExitStack() as stack:
-        for plugin in (source, *(node.plugin for node in plan.stages)):
-            stack.callback(plugin.close)
-            if isinstance(plugin, Source | Stage):
-                plugin.open()
+        for node in (plan.source, *plan.stages):
+            stack.enter_context(opened(node))
         tracemalloc.start()
         stack.callback(tracemalloc.stop)
         for ticket, frame in enumerate(islice(source.frames(), TRACED_FRAMES)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -13,12 +14,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mushpipe.core.errors import EXIT_DIFFERS
+from mushpipe.core.overwriting import require_writable, spare, write_text
 from mushpipe.options import file_argument, file_option, finite
 
 if TYPE_CHECKING:
     from mushpipe.core.plan import Plan
     from mushpipe.proof.compare import Comparison, Difference
 
+logger = logging.getLogger("mushpipe")
 SpeedOption = Annotated[
     float,
     typer.Option(
@@ -52,7 +56,6 @@ def compare(
     long: Annotated[bool, typer.Option("--long", help="tell of every frame")] = False,
 ) -> None:
     """Compare two result recordings; exit with 3 where they differ."""
-    from mushpipe.core.errors import EXIT_DIFFERS
     from mushpipe.proof.compare import compare as compare_files
 
     found = compare_files(a, b, tol, topics)
@@ -108,14 +111,10 @@ def bench(
 
     What its sinks write goes to a temporary folder.
     """
-    import logging
-
     from mushpipe.console import set_up_logging
     from mushpipe.core.document import read_document
-    from mushpipe.core.errors import EXIT_DIFFERS
     from mushpipe.core.files import files_read
     from mushpipe.core.graph import compile_document
-    from mushpipe.core.overwriting import require_writable, spare, write_text
     from mushpipe.core.plugins import load_registry
     from mushpipe.proof.bench import bench as measure
     from mushpipe.proof.bench import changes, conditions, read_baseline, slower
@@ -127,12 +126,12 @@ def bench(
     now = conditions(_endless(plan, frames, speed))
     before = read_baseline(baseline, now) if baseline else None
     for text in (*plan.warnings, *(changes(now, before) if before else ())):
-        logging.getLogger("mushpipe").warning(text)
+        logger.warning(text)
     with TemporaryDirectory(prefix="mushpipe-bench-") as folder:
         plan = plan.into(Path(folder))  # results of a run stay as they are
         result = measure(lambda count: _endless(plan, count, speed), frames)
     if result["failed"]:
-        logging.getLogger("mushpipe").warning(
+        logger.warning(
             f"{result['failed']} frames failed: times are also of what was done of these"
         )
     ratios = slower(result, before) if before else {}
@@ -141,7 +140,7 @@ def bench(
         write_text(out, json.dumps(result, indent=2) + "\n")
     too_slow = {name: ratio for name, ratio in ratios.items() if ratio > allow}
     for name, ratio in too_slow.items():
-        logging.getLogger("mushpipe").error(
+        logger.error(
             f"{name} takes {ratio:.2f} times as long as in {baseline}; --allow is {allow:g}"
         )
     raise typer.Exit(EXIT_DIFFERS if too_slow else 0)

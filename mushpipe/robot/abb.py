@@ -8,20 +8,15 @@ from __future__ import annotations
 
 import hmac
 import re
+from typing import get_args
 
 from mushpipe.robot.hub import Ending, Hub, Result, ceil_ms
-from mushpipe.robot.ledger import Outcome
-from mushpipe.robot.messages import LONGEST_HOLD_MS, NAME, Refusal
+from mushpipe.robot.messages import LONGEST_HOLD_MS, NAME, Outcome, Refusal
 from mushpipe.robot.session import Outgoing
 from mushpipe.robot.targets import Target
 
 LONGEST = 79
-_OUTCOMES: dict[str, Outcome] = {
-    "ACCEPTED": "accepted",
-    "REJECTED": "rejected",
-    "DONE": "done",
-    "FAILED": "failed",
-}
+_OUTCOMES: dict[str, Outcome] = {outcome.upper(): outcome for outcome in get_args(Outcome)}
 
 
 def target_line(target: Target, age_ms: int) -> str | None:

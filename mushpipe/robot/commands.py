@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mushpipe.core.errors import InputError
 from mushpipe.options import file_argument, file_option, finite
 
 if TYPE_CHECKING:
@@ -233,7 +234,6 @@ def replay(
 
     To a client every message says that it is a replay. Ends with 4 where the file is damaged.
     """
-    from mushpipe.core.errors import InputError
     from mushpipe.robot.replay import as_client, as_server, lines_of
 
     def show(sign: str, text: bytes) -> None:

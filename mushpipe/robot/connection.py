@@ -168,7 +168,7 @@ class Connection:
 
     def _take(self, now: float) -> bytes | None:
         """Return the next whole line, or what is already too long for one."""
-        if self._tokens < 1:
+        if self.throttled:
             return None
         end = self._line_end()
         if end < 0 and len(self._in) <= MAX_LINE:

@@ -13,8 +13,16 @@ from weakref import WeakValueDictionary
 import orjson
 
 from mushpipe.robot.clock import Clock
-from mushpipe.robot.ledger import Ledger, Outcome
-from mushpipe.robot.messages import CLIENT_TIMEOUT_S, HEARTBEAT_S, PROTOCOL, VERSION, Refusal, State
+from mushpipe.robot.ledger import Ledger
+from mushpipe.robot.messages import (
+    CLIENT_TIMEOUT_S,
+    HEARTBEAT_S,
+    PROTOCOL,
+    VERSION,
+    Outcome,
+    Refusal,
+    State,
+)
 from mushpipe.robot.places import Places
 from mushpipe.robot.targets import Choice, Reason, Target
 
@@ -141,8 +149,8 @@ class Hub:
 
     def age_ms(self, now: float) -> int | None:
         """Return the age of the newest result, rounded up; None where nobody knows it."""
-        age = max(0.0, now - self.newest.taken) if self.newest else float("inf")
-        return None if age == float("inf") else ceil_ms(age)
+        age = max(0.0, now - self.newest.taken) if self.newest else math.inf
+        return None if age == math.inf else ceil_ms(age)
 
     def envelope(self, now: float) -> dict[str, Any]:
         """Return what stands in every message."""
@@ -193,11 +201,11 @@ class Hub:
         """Return the targets nobody has claimed, best first."""
         choice = result.choice
         self._places.look(choice, self.ledger.claimed())
-        unnamed = (t for t in choice.targets if not self.ledger.hides(t.id))
-        return [t for t in unnamed if not self._places.taken(t, choice.frame)]
+        shown = (t for t in choice.targets if not self.ledger.hides(t.id))
+        return [t for t in shown if not self._places.taken(t, choice.frame)]
 
     def offered(self, result: Result) -> list[Target]:
-        """Return the first of them, as many as may be sent."""
+        """Return the first targets nobody has claimed, as many as may be sent."""
         return self.free(result)[: self.settings.max_targets]
 
     def _body(self, result: Result, most: int) -> tuple[bytes, dict[Reason, int], bool]:

@@ -6,9 +6,8 @@ from collections.abc import Set
 from dataclasses import dataclass
 from typing import Literal
 
-from mushpipe.robot.messages import Refusal
+from mushpipe.robot.messages import Outcome, Refusal
 
-Outcome = Literal["accepted", "rejected", "done", "failed"]
 MOST_ENTRIES = 4096
 
 

@@ -26,6 +26,7 @@ def _whole(value: Any) -> Any:
 
 Whole = Annotated[int, BeforeValidator(_whole)]
 Id = Annotated[Whole, Field(ge=0, le=2**53 - 1)] | Annotated[str, Field(max_length=64)]
+Outcome = Literal["accepted", "rejected", "done", "failed"]
 State = Literal["running", "stalled", "no_camera"]
 Code = Literal[
     "bad_json",
@@ -89,7 +90,7 @@ class Ack(_Message):
     op: Literal["ack"]
     id: Id
     target: str = Field(pattern=r"^m[0-9]{1,15}$")
-    result: Literal["accepted", "rejected", "done", "failed"]
+    result: Outcome
     hold_ms: Whole = Field(0, ge=0, le=LONGEST_HOLD_MS)
     reason: str = Field("", max_length=200)
 

@@ -50,8 +50,8 @@ def lines_of(path: Path, client: int | None = None) -> tuple[list[Line], list[st
 
 def as_client(
     lines: Iterable[Line], host: str, port: int, show: Show, hello: Mapping[str, Any] | None = None
-) -> int:
-    """Send what the client sent, at once, and show the answers; return how many came.
+) -> None:
+    """Send what the client sent, at once, and show the answers.
 
     Args:
         lines: The transcript.
@@ -69,16 +69,14 @@ def as_client(
         socket.create_connection((host, port), SILENCE_S) as sock,
     ):
         saying = sender.submit(_say, sock, said, hello or {}, show)
-        count, last = 0, b""
+        last = b""
         with sock.makefile("rb") as answers:
             for answer in answers:
                 last = answer.rstrip(b"\n")
                 show("<", last)
-                count += 1
         saying.result()
     if b'"fatal":true' in last:
         raise ConnectionError("the server ended the conversation: see its last line")
-    return count
 
 
 def _say(sock: socket.socket, said: list[bytes], hello: Mapping[str, Any], show: Show) -> None:
@@ -86,7 +84,8 @@ def _say(sock: socket.socket, said: list[bytes], hello: Mapping[str, Any], show:
     with suppress(OSError):  # it has hung up; its last line says why
         try:
             for text in said:
-                line = orjson.dumps({**orjson.loads(text), **hello}) if _is_hello(text) else text
+                body = _object(text) or {}
+                line = orjson.dumps({**body, **hello}) if body.get("op") == "hello" else text
                 show(">", text)
                 sock.sendall(line + b"\n")
         finally:
@@ -94,15 +93,10 @@ def _say(sock: socket.socket, said: list[bytes], hello: Mapping[str, Any], show:
             sock.shutdown(socket.SHUT_WR)
 
 
-def _is_hello(line: bytes) -> bool:
-    body = _object(line)
-    return body is not None and body.get("op") == "hello"
-
-
 def as_server(
     lines: Iterable[Line], port: int, show: Show, listening: Callable[[int], None]
-) -> int:
-    """Send to one client, on loopback, what the server sent; return how many lines that were.
+) -> None:
+    """Send to one client, on loopback, what the server sent.
 
     Every message says ``replay``, and an answer waits for a request of the client, whose id it
     takes. Targets go only to a client that accepts a recording: by ``accept_replay`` in its hello,
@@ -114,12 +108,9 @@ def as_server(
         connection, _ = server.accept()
     connection.settimeout(SILENCE_S)
     with connection, connection.makefile("rb") as heard:
-        count = 0
         for text in _answers(lines, _Asked(heard, show)):
             show(">", text)
             connection.sendall(text + b"\n")
-            count += 1
-    return count
 
 
 class _Asked:

@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 
 from mushpipe.core.errors import UsageError
-from mushpipe.robot.connection import SEND_BUFFER, Connection, Kind, Limits, Observer
+from mushpipe.robot.connection import SEND_BUFFER, Connection, Limits, Observer
 from mushpipe.robot.hub import Ending, Hub
 from mushpipe.robot.messages import Refusal
 from mushpipe.robot.session import Session
@@ -47,10 +47,6 @@ class Options:
     tls: ssl.SSLContext | None = None
 
 
-def _nobody(kind: Kind, client: int, text: bytes) -> None:
-    """Observe nothing."""
-
-
 class RobotServer:
     """Serves a hub to robots until `stop`.
 
@@ -58,7 +54,7 @@ class RobotServer:
         UsageError: An address cannot be listened on.
     """
 
-    def __init__(self, hub: Hub, options: Options, observe: Observer = _nobody) -> None:
+    def __init__(self, hub: Hub, options: Options, observe: Observer) -> None:
         self.hub = hub
         self._options = options
         self._observe = observe
@@ -210,7 +206,6 @@ class RobotServer:
             client.serve()
         except Exception:  # a fault met with one client must not cost the others theirs
             logger.exception("robot client %d: internal error; it is disconnected", client.number)
-            self._unregister(client)
             client.abort("internal error")
         if client.gone:
             self._unregister(client)

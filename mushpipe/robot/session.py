@@ -81,12 +81,10 @@ class JsonSession:
         hub = self._hub
         if not self._greeted:
             self._greeted = True
-            self._sent = 0
             return Outgoing(dump("hello", **hub.greeting(now)))
         if self._last_word is not None:
             self.closing = True
-            content = {"reason": self._last_word, **hub.envelope(now)}
-            return Outgoing(dump("bye", **content))
+            return Outgoing(dump("bye", reason=self._last_word, **hub.envelope(now)))
         if not self.ready:
             return None
         state = hub.state(now)

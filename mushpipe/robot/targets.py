@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import orjson
@@ -19,16 +19,13 @@ from mushpipe.core.arrays import Bools, Floats, Rows
 from mushpipe.core.geometry import axis_from_quaternion
 from mushpipe.core.group import Group
 from mushpipe.core.tables import AXIS_TOLERANCE, LARGEST_M, DepthSource, PickFlag, Picks
-from mushpipe.core.transform import REACH
+from mushpipe.core.transform import REACH, UNIT_TOLERANCE
 
 Reason = Literal["no_depth", "estimated", "invalid", "workspace", "claimed", "limit"]
-REASONS: tuple[Reason, ...] = ("no_depth", "estimated", "invalid", "workspace", "claimed", "limit")
 Vector = tuple[float, float, float]
-
 
 _FLAGS = tuple((int(flag), flag.name.lower()) for flag in PickFlag if flag.name)
 _SOURCES = {int(source): source.name.lower() for source in DepthSource}
-UNIT_TOLERANCE = 1e-3
 # Beyond these a number is not a measurement.
 FARTHEST_M, SMALLEST_M = 100.0, 0.0001
 ID_LIMIT = 10**15  # an acknowledgement has no place for more digits
@@ -127,7 +124,7 @@ class Filter:
         if self._workspace is not None:
             bad["workspace"] = ~self._workspace.contains(picks.position)
         left = np.ones(len(picks), bool)
-        withheld: dict[Reason, int] = dict.fromkeys(REASONS, 0)
+        withheld: dict[Reason, int] = dict.fromkeys(get_args(Reason), 0)
         for reason, rows in bad.items():
             withheld[reason] = int((left & rows).sum())
             left &= ~rows

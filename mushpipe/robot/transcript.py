@@ -84,7 +84,8 @@ class Transcript:
                 pass
         except RecordingError as error:
             logger.error("the robot's transcript ends here: %s", error)
-            self._drop_the_rest()
+            with self._lock:
+                self._waiting = MOST_BYTES + 1  # no more is taken
 
     def _pass_on(self) -> bool:
         """Write what comes for a while, then make it safe; False at the end."""
@@ -106,10 +107,6 @@ class Transcript:
         if missing:
             text = f"{missing} lines are missing here".encode()
             self._write(Line("event", 0, text, line.time_ns), wall_ns)
-
-    def _drop_the_rest(self) -> None:
-        with self._lock:
-            self._waiting = MOST_BYTES + 1
 
     def _write(self, line: Line, wall_ns: int) -> None:
         header = Header(wall_ns, self._count, "")

@@ -12,7 +12,7 @@ from mushpipe.sources.images import GIVEN_CAMERA, decode_camera, distortion
 from mushpipe.sources.recorded import RecordedSource
 from mushpipe.sources.topics import Topics, is_beside, other_camera
 
-Recorded = Camera | None | EllipsisType  # which is that nothing was stated yet
+Recorded = Camera | None | EllipsisType  # `...`: nothing was stated yet
 _RECTIFIED = ("rect", "rectified")  # image_rect_color, as ROS has it; others say image_color_rect
 
 

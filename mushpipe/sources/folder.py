@@ -21,7 +21,6 @@ from mushpipe.core.types import COLOR_FRAME
 from mushpipe.sources.recorded import NO_CAMERA, NO_DEPTH, Intrinsics
 
 logger = logging.getLogger("mushpipe")
-_TO_RGB = cv2.COLOR_BGR2RGB
 ALONE = "%s images without a %s image"
 
 
@@ -142,7 +141,7 @@ class ImagesSource(ReplaySource):
                 f"{color}: {8 * read.itemsize} bits a channel, expected 8; where it is depth, name "
                 "it by source.depth, and what is colour by source.color"
             )
-        image = cv2.cvtColor(read, _TO_RGB)
+        image = cv2.cvtColor(read, cv2.COLOR_BGR2RGB)
         values = None if depth is None else _read(depth, cv2.IMREAD_UNCHANGED)
         size = image.shape[:2]
         self._first = self._first or size

@@ -124,9 +124,8 @@ def decode_depth(message: Any, scale: float | None) -> tuple[NDArray[Any], float
         )
     dtype, default = _DEPTH[message.encoding]
     order = ">" if getattr(message, "is_bigendian", 0) else "<"
-    item = np.dtype(dtype).itemsize
     native = np.dtype(dtype)
-    image = np.ascontiguousarray(_pixels(message, item)).view(order + dtype)
+    image = np.ascontiguousarray(_pixels(message, native.itemsize)).view(order + dtype)
     return image.astype(native, copy=False), _known_scale(scale, default, message.encoding)
 
 
@@ -197,7 +196,7 @@ def decode_camera(message: Any, rectified: bool) -> Camera | None:
         raise ValueError(
             f"a calibration for images of {message.width}x{message.height} px: give {GIVEN_CAMERA}"
         )
-    model: str = "none"
+    model = "none"
     coefficients: tuple[float, ...] = ()
     if any(d) or (message.distortion_model in _FISHEYE and not rectified):
         names = {wire: own for own, wire in DISTORTION_MODELS.items()}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -40,7 +40,6 @@ class McapSource(RecordedSource, ReplaySource):
     end: float | None = Field(None, gt=0, le=1e9, description="stop at this second, counted alike")
     loop: int = Field(1, ge=0, description="how many times to play it; 0 is for ever")
 
-    _counts: Counter[str] = PrivateAttr(default_factory=Counter)
     _reader: RecordingReader | None = PrivateAttr(None)
 
     def files(self) -> tuple[Path, ...]:
@@ -74,10 +73,6 @@ class McapSource(RecordedSource, ReplaySource):
         require_kind(str(self.path), "depth", next(first(self.depth_topic), None), first(*images))
         named = (self.color_topic, self.depth_topic, self.camera_topic)
         return index, choose_topics(index, self.path, *named, self.use_depth)
-
-    def counts(self) -> dict[str, int]:
-        """Return how many images found no partner or could not be decoded."""
-        return {name: count for name, count in sorted(self._counts.items()) if count}
 
     def frames(self) -> Iterator[RgbdFrame]:
         """Yield the frames of the recording.

@@ -199,7 +199,7 @@ class Player:
         return stamp_ns, (frame_id, *decode_depth(message, scale))
 
     def _frame(self, color: _Color, depth: _Depth | None) -> RgbdFrame:
-        image = color.image
+        image, size = color.image, color.image.shape[:2]
         sequence = color.header.sequence if self.numbered else self.frames
         header = replace(color.header, sequence=sequence)
         self.frames += 1
@@ -209,11 +209,10 @@ class Player:
                 f"{self.name}: depth ({self.topics.depth}) is in frame '{depth[0]}', "
                 f"colour in '{header.frame_id}': {_ALIGN}"
             )
-        if depth and depth[1].shape != image.shape[:2]:
-            (h, w), (high, wide) = depth[1].shape, image.shape[:2]
+        if depth and depth[1].shape != size:
+            (h, w), (high, wide) = depth[1].shape, size
             sizes = f"depth ({self.topics.depth}) is {w}x{h}, colour {wide}x{high}"
             raise InputError(f"{self.name}, frame {sequence}: {sizes}: {_ALIGN}")
-        size = image.shape[:2]
         self._watch_size(size, sequence)
         try:
             native, scale = depth[1:] if depth else (None, 0.001)

@@ -174,7 +174,7 @@ class RealsenseSource(ReplaySource):
 
     def _played(self, link: Link, maker: FrameMaker) -> Iterator[RgbdFrame]:
         """Yield frames until the link ends; a camera that sends no whole frameset is silent."""
-        quiet_s, whole = 0.0, maker.whole
+        whole = maker.whole
         while not self._interrupted.is_set():
             begin = time.monotonic()
             frames = link.wait()
@@ -183,13 +183,12 @@ class RealsenseSource(ReplaySource):
                 return
             frame = maker.make(frames, time.time_ns()) if frames is not None else None
             if maker.whole > whole or not (frames is None or link.live):
-                quiet_s, whole = 0.0, maker.whole
+                self._quiet_s, whole = 0.0, maker.whole
                 self._is_back()
             else:
-                quiet_s += POLL_MS / 1000 if frames is None else time.monotonic() - begin
-                self._quiet_s = quiet_s
-                if frames is None or quiet_s >= self.patience_s:
-                    link.check(quiet_s, self.patience_s)
+                self._quiet_s += POLL_MS / 1000 if frames is None else time.monotonic() - begin
+                if frames is None or self._quiet_s >= self.patience_s:
+                    link.check(self._quiet_s, self.patience_s)
             if frame is not None:
                 yield frame
 
@@ -218,11 +217,9 @@ class RealsenseSource(ReplaySource):
             self._waited_s += pause_s
             pause_s = min(2 * pause_s, 5.0)
             try:
-                link = self._connect()
+                return self._connect()
             except DeviceError as error:
                 logger.debug("%s", error)
-            else:
-                return link
         raise DeviceError(
             f"the camera was lost ({why}) and did not come back within {self.reconnect_s:g} s"
         )

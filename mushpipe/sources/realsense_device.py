@@ -95,8 +95,8 @@ def find_device(context: Any, serial: str | None) -> Any:
     if not devices:
         raise no_camera(USB)
     known = [info(device).get("serial_number", "") for device in devices]
-    told = sorted(f"{info(d).get('name')} {info(d).get('serial_number')}" for d in devices)
-    listed = ", ".join(told)
+    told = (f"{info(d).get('name')} {info(d).get('serial_number')}" for d in devices)
+    listed = ", ".join(sorted(told))
     if serial is None:
         if len(devices) > 1:
             raise UsageError(f"several cameras are connected, set source.serial: {listed}")
@@ -128,7 +128,8 @@ def describe(profile: Any) -> dict[str, Any]:
     Args:
         profile: A resolved pipeline profile.
     """
-    streams = [stream.as_video_stream_profile() for stream in _video(profile)]
+    video = (stream for stream in profile.get_streams() if stream.is_video_stream_profile())
+    streams = [stream.as_video_stream_profile() for stream in video]
     result: dict[str, Any] = {**info(profile.get_device()), "librealsense": version("pyrealsense2")}
     result["streams"] = {
         stream.stream_name(): {
@@ -151,10 +152,6 @@ def describe(profile: Any) -> dict[str, Any]:
     sensors = profile.get_device().query_sensors()
     result["options"] = {str(sensor.name): _values(sensor) for sensor in sensors}
     return result
-
-
-def _video(profile: Any) -> list[Any]:
-    return [stream for stream in profile.get_streams() if stream.is_video_stream_profile()]
 
 
 def _intrinsics(given: Any) -> dict[str, Any]:

@@ -1,8 +1,10 @@
-"""Settings of every source that plays recorded messages."""
+"""What sources that play recorded messages have in common."""
 
 from __future__ import annotations
 
-from pydantic import Field
+from collections import Counter
+
+from pydantic import Field, PrivateAttr
 
 from mushpipe.core.geometry import Camera
 from mushpipe.core.group import Group
@@ -46,7 +48,7 @@ class Intrinsics(Group):
 
 
 class RecordedSource(Source):
-    """Settings of every source that reads recorded messages."""
+    """A source that reads recorded messages: its settings, and what of these was of no use."""
 
     color_topic: str | None = Field(None, description="colour images; chosen by name if not given")
     depth_topic: str | None = Field(None, description="depth images aligned to colour")
@@ -64,3 +66,9 @@ class RecordedSource(Source):
     camera: Intrinsics | None = Field(
         None, description="intrinsics, in place of those of the recording"
     )
+
+    _counts: Counter[str] = PrivateAttr(default_factory=Counter)
+
+    def counts(self) -> dict[str, int]:
+        """Return how many images found no partner or could not be decoded."""
+        return {name: count for name, count in sorted(self._counts.items()) if count}

@@ -8,7 +8,6 @@ import os
 import select
 import stat
 import threading
-from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from io import BufferedReader, RawIOBase
@@ -50,7 +49,6 @@ class StreamSource(RecordedSource):
     _records: Iterator[McapRecord] = PrivateAttr(default_factory=lambda: iter(()))
     _input: BufferedReader | None = PrivateAttr(None)
     _manifest: dict[str, str] = PrivateAttr(default_factory=dict)
-    _counts: Counter[str] = PrivateAttr(default_factory=Counter)
     _interrupted: threading.Event = PrivateAttr(default_factory=threading.Event)
 
     @property
@@ -101,10 +99,6 @@ class StreamSource(RecordedSource):
         """Return what the sender says of its camera."""
         device = json.loads(self._manifest.get("json", "{}")).get("device", {})
         return device if isinstance(device, dict) else {}
-
-    def counts(self) -> dict[str, int]:
-        """Return how many images found no partner or could not be decoded."""
-        return {name: count for name, count in sorted(self._counts.items()) if count}
 
     def interrupt(self) -> None:
         """Stop waiting for the sender."""

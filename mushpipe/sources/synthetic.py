@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import count
 from typing import Self
 
 from pydantic import Field, model_validator
@@ -57,10 +58,8 @@ class SyntheticSource(SceneSettings, ReplaySource):
         """
         travel = self.travel_mm / 1000 if self.step_mm else 0.0
         scene = Scene(self, self.color, self.sensor, travel)
-        sequence = 0
-        while True:
+        for sequence in count():
             yield self._frame(scene, sequence, travel)
-            sequence += 1
 
     def _frame(self, scene: Scene, sequence: int, travel: float) -> RgbdFrame:
         still = scene.still(self._along(sequence, travel))

@@ -43,7 +43,7 @@ def choose_topics(
     color: str | None,
     depth: str | None,
     camera: str | None,
-    use_depth: bool = True,
+    use_depth: bool,
 ) -> Topics:
     """Choose by schema and name; what the user names is taken as it is.
 

@@ -15,7 +15,8 @@ from tests.robot.scene import choice
 def main() -> None:
     clock = Clock()
     hub = Hub(Settings(), clock)
-    server = RobotServer(hub, Options([Listener("127.0.0.1", int(sys.argv[1]), JsonSession)]))
+    options = Options([Listener("127.0.0.1", int(sys.argv[1]), JsonSession)])
+    server = RobotServer(hub, options, lambda *_: None)
     server.start()
     sys.stdout.write(f"{server.ports[0]}\n")
     sys.stdout.flush()

@@ -87,7 +87,8 @@ def test_a_client_that_floods_bad_lines_and_never_reads_is_not_kept() -> None:
 
 def test_a_server_that_never_served_gives_its_port_back() -> None:
     hub = Hub(Settings(), FakeClock())
-    server = RobotServer(hub, Options([Listener("127.0.0.1", 0, JsonSession)]))
+    options = Options([Listener("127.0.0.1", 0, JsonSession)])
+    server = RobotServer(hub, options, lambda *_: None)
     server.stop()
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.1", server.ports[0]))
