@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import resources
-from pathlib import Path
 from typing import Annotated, Self
 
 import cv2
@@ -25,6 +23,7 @@ from mushpipe.stages.discs import (
     many_likely,
 )
 from mushpipe.stages.letterbox import resized
+from mushpipe.stages.verifier import package_file
 
 FILE = "cap_net.onnx"
 KIND = "mushpipe cap-net 1"  # what the model's own metadata call it
@@ -100,13 +99,12 @@ class CapNet(Stage):
         """Return the model; raises as `open` does."""
         if self._net is not None:
             return self._net
-        path = self.model or Path(str(resources.files("mushpipe.stages") / FILE))
-        net = OnnxFile(path)
+        net = OnnxFile(self.model or package_file(FILE))
         kind = net.metadata.get("kind")
         if kind != KIND:
             raise UsageError(
-                f"model {path}: it calls itself {kind!r}, expected {KIND!r} as `make train` writes "
-                "it; for a model of your own use the stage `onnx`"
+                f"model {net.path}: it calls itself {kind!r}, expected {KIND!r} as `make train` "
+                "writes it; for a model of your own use the stage `onnx`"
             )
         self._net = net
         return net
