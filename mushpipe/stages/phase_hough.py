@@ -35,7 +35,7 @@ from mushpipe.stages.phase.polish import polish
 from mushpipe.stages.phase.refit import refit
 from mushpipe.stages.phase.strips import Strips, in_strips
 from mushpipe.stages.phase.verifier import load_verifier
-from mushpipe.stages.phase.votes import CELL, centres
+from mushpipe.stages.phase.votes import centres
 from mushpipe.stages.verifier_net import Models
 from mushpipe.stages.warm_up import example_circles, example_frame
 
@@ -252,7 +252,7 @@ class PhaseHough(Stage):
         smallest, largest = self.radius_px or (8.0, 38.0)
         if largest is None:
             by_depth = self.diameter_mm[1] / 2000 / relief.pixel if relief.known else 0
-            largest = max(_LARGE, by_depth, largest_of(learned, LIKELY))
+            largest = max(_LARGE, by_depth, largest_of(learned))
         if self.radius_px is None and relief.known:
             # a cap is nearer than the bed, hence larger in the image
             near = relief.bed_pixel(*np.array([(0, width, 0, width), (0, 0, height, height)]))
@@ -265,7 +265,7 @@ class PhaseHough(Stage):
         otsu = max(otsu_of(gradient.size), _FLOOR)
         edges, pixels = edges_of(image, gradient, region, self.edge * otsu, 1.2 * otsu)
         if relief.known:
-            edges = fused(edges, pixels, relief.edges(), CELL)
+            edges = fused(edges, pixels, relief.edges())
         return in_strips(edges, *image.shape)
 
     def _plausible(self, shapes: Floats, middle: Floats, relief: Relief) -> Bools:
