@@ -27,12 +27,7 @@ from mushpipe.stages.chan_vese import ChanVese
 from mushpipe.stages.flatten import Flatten
 from mushpipe.stages.opening import Opening
 from mushpipe.stages.otsu import Otsu
-from mushpipe.stages.phase.features import (
-    DEPTH_FEATURES,
-    IMAGE_FEATURES,
-    LEARNED,
-    NAMES,
-)
+from mushpipe.stages.phase.features import DEPTH_FEATURES, IMAGE_FEATURES, LEARNED, NAMES
 from mushpipe.stages.phase.verifier import FILE
 from mushpipe.stages.phase_hough import EVIDENCE, PhaseHough, equal_area_radius
 from mushpipe.stages.verifier_net import LIMIT, WIDTHS, write_models

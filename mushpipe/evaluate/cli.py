@@ -41,8 +41,7 @@ MatrixOption = Annotated[
     list[str] | None, typer.Option(metavar="A.B=X,Y", help="compare alternatives with the first")
 ]
 ThresholdOption = Annotated[
-    list[str] | None,
-    typer.Option(metavar="METRIC>=X", help="exit with 3 where missed: 'f>=0.98'"),
+    list[str] | None, typer.Option(metavar="METRIC>=X", help="exit with 3 where missed: 'f>=0.98'")
 ]
 PlaneOption = Annotated[
     str | None,

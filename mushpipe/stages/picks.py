@@ -111,11 +111,7 @@ class MakePicks(Stage):
         Tracks().update(two, unknown, (8, 8), 0, 0)
 
     def process(
-        self,
-        frame: RgbdFrame,
-        circles: Circles,
-        locations: Locations,
-        poses: Poses | None = None,
+        self, frame: RgbdFrame, circles: Circles, locations: Locations, poses: Poses | None = None
     ) -> Picks:
         """Return the picks, the first to pick first, in the robot's frame or the camera's.
 
