@@ -134,7 +134,7 @@ def errors(score: Score) -> str:
     """Return centre and radius errors as text."""
     if not score.errors:
         return "no match"
-    away, larger, visible, _ = np.array(score.errors).T
+    away, larger, visible = np.array(score.errors).T
     half = visible >= 0.5
     return (
         f"centre median {np.median(away[half]):.2f} p95 {np.percentile(away[half], 95):.2f}, "

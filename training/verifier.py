@@ -99,10 +99,9 @@ def prepared(cache: Path) -> Iterator[Prepared]:
     """Yield the frames of the training, without and with the circles of `cap-net`.
 
     Beside `cap-net`, which has a look with depth and one without, its mask takes the place of a
-    segmentation. A network is surer of frames like
-    those it was trained on than of any others, so each frame comes a second time with a `doubtful`
-    one. And as real caps are not as clean as simulated ones, all of that comes once more on a
-    `stained` frame and on a `harder` one.
+    segmentation. A network is surer of frames like those it was trained on than of any others, so
+    each frame comes a second time with `doubtful` circles. And as real caps are not as clean as
+    simulated ones, all of that comes once more on a `stained` frame and on a `harder` one.
     """
     rng, other, deep = (np.random.default_rng(seed) for seed in range(3))
     varied = list(varied_cases(cache, VERIFIER_SEED, "a", VARIED))

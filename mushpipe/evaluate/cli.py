@@ -245,7 +245,7 @@ def _print(items: Iterable[Any]) -> None:
 
     console = Console(file=sys.stdout, highlight=False, markup=False)
     if not console.is_terminal:
-        console = Console(file=sys.stdout, highlight=False, markup=False, width=200)
+        console.width = 200
     for item in items:
         console.print(item)
         console.print()

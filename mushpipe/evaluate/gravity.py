@@ -141,7 +141,7 @@ def _decoded(decoder: Decoder, raw: Raw, path: Path) -> Any:
 def _beside_bed(path: Path, up: Floats) -> tuple[float | None, str]:
     """Return the angle, degrees, between an upright and the bed's normal, or why there is none."""
     try:
-        frame = next(iter(McapSource(path=path, max_frames=1).frames()), None)
+        frame = next(McapSource(path=path, max_frames=1).frames(), None)
     except InputError as error:  # a recording of the IMU alone, or one that has to be chosen from
         return None, str(error).removeprefix(f"{path}: ").split(";")[0]
     if frame is None or frame.depth is None:

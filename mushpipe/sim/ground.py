@@ -103,8 +103,8 @@ def soil(
     albedo = (base * np.exp(tone)[..., None] * tilt).astype(np.float32)
     _fibres(albedo, texel, area, rng)
     cover = _mycelium(shape, texel, mycelium, area, rng)
-    white = np.array([0.50, 0.50, 0.48], np.float32)
-    albedo = mix(albedo.reshape(-1, 3), (*white,), cover.ravel()).reshape(albedo.shape)
+    white = (0.50, 0.50, 0.48)
+    albedo = mix(albedo.reshape(-1, 3), white, cover.ravel()).reshape(albedo.shape)
     height = height + 0.0007 * cover
     return Ground(area, texel, height.astype(np.float32), albedo, Material.SOIL)
 
