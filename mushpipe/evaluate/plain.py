@@ -53,7 +53,6 @@ def _section(section: Section) -> Json:
         "recordings": [
             {
                 **_with_metrics(summary),
-                "name": judged.name,
                 "results": str(judged.results.path),
                 "topic": judged.results.topic,
                 "truth": judged.truth.name,
