@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Self
+from typing import Self
 
 import cv2
 import numpy as np
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import Field, PositiveFloat, PrivateAttr, model_validator
 
 from mushpipe import Circles, GraphPath, Header, Mask, RgbdFrame, Stage
 from mushpipe.core.arrays import Bools, Bytes, Floats, Singles, locked
@@ -41,9 +41,6 @@ _WIDTH, _LARGE = 640, 45.0
 _CLEARLY = 1.25  # so much more of the image circles at another scale must explain
 
 
-Positive = Annotated[float, Field(gt=0)]
-
-
 class CapNet(Stage):
     """Detects caps in colour with a network of 161 000 parameters, trained on simulated beds.
 
@@ -52,7 +49,7 @@ class CapNet(Stage):
     large caps can be in the image.
     """
 
-    radius_px: tuple[Positive, Positive | None] = Field(
+    radius_px: tuple[PositiveFloat, PositiveFloat | None] = Field(
         (8, 45),
         description="smallest and largest radius, px; circles may be a tenth beyond; the image is "
         "scaled to suit. [8, null]: what largest_mm is at the depth that is seen, 60 px or more; "

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal, Self
 
 import cv2
 import numpy as np
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import Field, PositiveFloat, PrivateAttr, model_validator
 
 from mushpipe import Circles, Mask, RgbdFrame, Stage, UsageError
 from mushpipe.core.arrays import Bools, Bytes, Floats, Ints32, Singles
@@ -38,8 +38,6 @@ from mushpipe.stages.phase.verifier import load_verifier
 from mushpipe.stages.phase.votes import centres
 from mushpipe.stages.verifier_net import Models
 from mushpipe.stages.warm_up import example_circles, example_frame
-
-Positive = Annotated[float, Field(gt=0)]
 
 _FLOOR = 4.0  # gray levels per px; Otsu's threshold of an image without edges is noise
 _AROUND = np.ones((7, 7), np.uint8)  # edges are taken so far around the foreground
@@ -95,13 +93,13 @@ class PhaseHough(Stage):
     input: Literal["image", "mask"] = Field(
         "image", description="where edges are taken from; `mask` is the paper's variant, no depth"
     )
-    radius_px: tuple[Positive, Positive | None] | None = Field(
+    radius_px: tuple[PositiveFloat, PositiveFloat | None] | None = Field(
         (8.0, 38.0),
         description="smallest and largest radius looked for, px; outlines may be fitted a tenth "
         "beyond; null takes them from diameter_mm and depth. [8, null]: 80 px, or more where a cap "
         "of diameter_mm is larger at the depth that is seen, or one that is learned",
     )
-    diameter_mm: tuple[Positive, Positive] = Field(
+    diameter_mm: tuple[PositiveFloat, PositiveFloat] = Field(
         (6.0, 120.0), description="smallest and largest diameter, mm, where there is depth"
     )
     min_score: float = Field(0.5, ge=0, le=1, description="smallest score that is kept")
