@@ -118,7 +118,7 @@ class EdgeWatch:
             _tell_strange(self._places, self._confirmed)
             return
         self.amiss_px = float(np.hypot(np.hypot(*found[1:]), found[0] + stated))
-        _tell(found, stated, unsure)
+        _tell_amiss(found, stated, unsure)
 
 
 def _tell_strange(places: int, confirmed: int) -> None:
@@ -143,7 +143,7 @@ def _amiss(found: Floats, stated: float, unsure: float) -> tuple[bool, bool]:
     return bool(shifted), bool(abs(found[0] + stated) > AMISS + unsure)
 
 
-def _tell(found: Floats, stated: float, unsure: float) -> None:
+def _tell_amiss(found: Floats, stated: float, unsure: float) -> None:
     """Warn of what is amiss; arguments as `_amiss`."""
     shifted, wider = _amiss(found, stated, unsure)
     if shifted:
