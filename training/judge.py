@@ -149,8 +149,8 @@ def reliability(score: Score) -> str:
     for low in np.linspace(0.5, 1, BINS, endpoint=False):
         part = values[(values[:, 0] >= low) & (values[:, 0] < low + 0.5 / BINS + 1e-9)]
         if len(part):
-            score, right = part.mean(axis=0)
-            lines.append(f"  score {score:.2f}: right {right:.2f} of {len(part)}")
+            said, right = part.mean(axis=0)
+            lines.append(f"  score {said:.2f}: right {right:.2f} of {len(part)}")
     return "\n".join(lines)
 
 

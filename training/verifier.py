@@ -120,8 +120,7 @@ def doubtful(circles: Circles, rng: np.random.Generator) -> Circles:
     """Return the circles of a network less sure of all, and of some much less than of others."""
     less = rng.uniform(0, 4) + rng.normal(0, 2, len(circles))
     score = expit(logit(np.clip(circles.score, 1e-6, 1 - 1e-6)) - less)
-    kept = score >= NET.min_score
-    return Circles(circles.center[kept], circles.radius[kept], score[kept])
+    return Circles(circles.center, circles.radius, score).take(score >= NET.min_score)
 
 
 def labels(case: Case, circles: Circles, order: Ints32) -> Floats:
