@@ -28,7 +28,7 @@ GRAPHS = {
     "classic.yaml": ROOT / "graphs/classic.yaml",
     "pick.yaml": ROOT / "graphs/pick.yaml",
 }
-CLI = [sys.executable, "-c", "from mushpipe.cli import main; main()"]
+CLI = [sys.executable, "-m", "mushpipe"]
 RECORDINGS = ("first-bed", "dense", "tilted", "brown", "harsh-light", "sparse")
 SLOW_MS = 1000
 COLUMNS = {

@@ -13,15 +13,7 @@ import numpy as np
 from skimage.filters import threshold_otsu
 from skimage.segmentation import chan_vese
 
-from mushpipe import (
-    Camera,
-    DepthSource,
-    PickFlag,
-    Picks,
-    RgbdFrame,
-    Stage,
-    quaternion_from_axis,
-)
+from mushpipe import Camera, DepthSource, PickFlag, Picks, RgbdFrame, Stage, quaternion_from_axis
 from mushpipe.core.libraries import import_open3d
 
 RADIUS_PX = (8, 45)

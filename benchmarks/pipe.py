@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-MAIN = [sys.executable, "-c", "from mushpipe.cli import main; main()"]
+MAIN = [sys.executable, "-m", "mushpipe"]
 PARTS = '''
 import time
 from collections.abc import Iterator

@@ -18,7 +18,7 @@ import numba
 import numpy as np
 from pose_scenes import frames, true_circles
 
-from mushpipe import Camera, Circles, DepthSource
+from mushpipe import Camera, DepthSource
 from mushpipe.core.arrays import Floats
 from mushpipe.core.libraries import import_open3d
 from mushpipe.stages.cap.attempt import ODD
@@ -60,8 +60,7 @@ def main() -> None:
     options = parser.parse_args()
     frame = frames(SCENE, SEED, "a", 1, options.cache)[0]
     found, _ = true_circles(frame)
-    rows = np.argsort(-found.radius, kind="stable")[: options.count]
-    circles = Circles(found.center[rows], found.radius[rows], found.score[rows])
+    circles = found.take(np.argsort(-found.radius, kind="stable")[: options.count])
     fit, nearest, register = CapFit(depth_bias_mm=2.85), NearestDepth(), Registration()
     for stage in (fit, nearest, register):
         stage.open()
@@ -77,8 +76,7 @@ def main() -> None:
     print(f"{holes} have a hole at the centre, {np.count_nonzero(fits.misfit > ODD)} fit poorly")
     fuse = FuseDepth()
     fuse.open()
-    spread = np.linspace(0, len(circles) - 1, options.registrations).astype(int)
-    few = Circles(circles.center[spread], circles.radius[spread], circles.score[spread])
+    few = circles.take(np.linspace(0, len(circles) - 1, options.registrations).astype(int))
     where = nearest.process(frame, few)
     often = options.repeats
     times = milliseconds(

@@ -15,6 +15,7 @@ import math
 import platform
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -181,9 +182,7 @@ def stage_ms(stage: Segmenter, frames: list[RgbdFrame]) -> float:
     for frame in frames:
         best = math.inf
         for _ in range(7):
-            fresh = RgbdFrame(
-                frame.header, frame.color, frame.depth, frame.depth_scale, frame.camera
-            )
+            fresh = replace(frame)
             start = time.thread_time()
             stage.process(fresh)
             best = min(best, time.thread_time() - start)

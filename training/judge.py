@@ -134,7 +134,7 @@ def errors(score: Score) -> str:
     """Return centre and radius errors as text."""
     if not score.errors:
         return "no match"
-    away, larger, visible, _ = np.array(score.errors).T
+    away, larger, visible = np.array(score.errors).T
     half = visible >= 0.5
     return (
         f"centre median {np.median(away[half]):.2f} p95 {np.percentile(away[half], 95):.2f}, "
@@ -149,8 +149,8 @@ def reliability(score: Score) -> str:
     for low in np.linspace(0.5, 1, BINS, endpoint=False):
         part = values[(values[:, 0] >= low) & (values[:, 0] < low + 0.5 / BINS + 1e-9)]
         if len(part):
-            score, right = part.mean(axis=0)
-            lines.append(f"  score {score:.2f}: right {right:.2f} of {len(part)}")
+            said, right = part.mean(axis=0)
+            lines.append(f"  score {said:.2f}: right {right:.2f} of {len(part)}")
     return "\n".join(lines)
 
 

@@ -35,14 +35,14 @@ def matched(iou: Floats, counts: Bools) -> tuple[Rows, Rows]:
 class Score:
     """Counts over frames, and the errors of what was matched.
 
-    `errors` holds centre error, radius error, share visible and true radius of each match;
-    `reliability` score and 1 or 0 of each circle that is right or wrong.
+    `errors` holds centre error, radius error and share visible of each match; `reliability` score
+    and 1 or 0 of each circle that is right or wrong.
     """
 
     right: int = 0
     missed: int = 0
     false: int = 0
-    errors: list[tuple[float, float, float, float]] = field(default_factory=list)
+    errors: list[tuple[float, float, float]] = field(default_factory=list)
     reliability: list[tuple[float, float]] = field(default_factory=list)
 
     def add(self, circles: Circles, truth: Truth, counts: Bools) -> None:
@@ -56,7 +56,7 @@ class Score:
         self.false += len(wrong)
         away = np.linalg.norm(circles.center[rows] - truth.center[columns], axis=1)
         larger = circles.radius[rows] - truth.radius[columns]
-        self.errors += zip(away, larger, truth.visible[columns], truth.radius[columns], strict=True)
+        self.errors += zip(away, larger, truth.visible[columns], strict=True)
         self.reliability += [(s, 1.0) for s in circles.score[rows]]
         self.reliability += [(s, 0.0) for s in circles.score[wrong]]
 

@@ -110,7 +110,7 @@ def stored(path: Path, condition: str, settings: dict[str, Any]) -> Case:
     if path.exists():
         case: Case = pickle.loads(path.read_bytes())
         return case
-    frame = next(iter(SyntheticSource(**settings).frames()))
+    frame = next(SyntheticSource(**settings).frames())
     family, seed = settings["shape_family"], settings["seed"]
     case = Case(condition, family, seed, frame, frame.attached[TRUTH_TOPIC])
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -22,7 +22,7 @@ def _mismatched(depth: Singles, rng: np.random.Generator) -> Singles:
         return depth
     width = 2 * int(rng.integers(15, 45)) + 1
     behind = cv2.GaussianBlur(cv2.dilate(depth, np.ones((width, width), np.uint8)), (0, 0), 4)
-    cloud = _blurred((depth.shape[0], depth.shape[1]), rng.uniform(8, 25), rng)
+    cloud = _blurred(depth.shape, rng.uniform(8, 25), rng)
     beyond = cloud - np.float32(rng.uniform(1, 2))
     lost = (depth == 0) | (np.abs(beyond) < 0.1)
     return np.where(lost, np.float32(0), np.where(beyond > 0, behind, depth))
@@ -52,8 +52,7 @@ def _blurred(shape: tuple[int, int], sigma: float, rng: np.random.Generator) -> 
 
 def _noisier(depth: Singles, rng: np.random.Generator) -> Singles:
     """Up to three times the noise that `cap-fit` expects, with neighbours alike."""
-    height, width = depth.shape
-    noise = _blurred((height, width), rng.uniform(0.3, 2.5), rng)
+    noise = _blurred(depth.shape, rng.uniform(0.3, 2.5), rng)
     sigma = rng.uniform(0, 3) * (0.0003 + 0.0012 * depth)
     return np.asarray(np.where(depth > 0, depth + sigma * noise, 0), np.float32)
 
@@ -70,8 +69,7 @@ def _without_edges(depth: Singles, rng: np.random.Generator) -> Singles:
 
 
 def _with_holes(depth: Singles, rng: np.random.Generator) -> Singles:
-    height, width = depth.shape
-    cloud = _blurred((height, width), rng.uniform(2, 8), rng)
+    cloud = _blurred(depth.shape, rng.uniform(2, 8), rng)
     return np.where(cloud > rng.uniform(1.5, 3.5), np.float32(0), depth)
 
 

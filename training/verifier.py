@@ -27,12 +27,7 @@ from mushpipe.stages.chan_vese import ChanVese
 from mushpipe.stages.flatten import Flatten
 from mushpipe.stages.opening import Opening
 from mushpipe.stages.otsu import Otsu
-from mushpipe.stages.phase.features import (
-    DEPTH_FEATURES,
-    IMAGE_FEATURES,
-    LEARNED,
-    NAMES,
-)
+from mushpipe.stages.phase.features import DEPTH_FEATURES, IMAGE_FEATURES, LEARNED, NAMES
 from mushpipe.stages.phase.verifier import FILE
 from mushpipe.stages.phase_hough import EVIDENCE, PhaseHough, equal_area_radius
 from mushpipe.stages.verifier_net import LIMIT, WIDTHS, write_models
@@ -104,10 +99,9 @@ def prepared(cache: Path) -> Iterator[Prepared]:
     """Yield the frames of the training, without and with the circles of `cap-net`.
 
     Beside `cap-net`, which has a look with depth and one without, its mask takes the place of a
-    segmentation. A network is surer of frames like
-    those it was trained on than of any others, so each frame comes a second time with a `doubtful`
-    one. And as real caps are not as clean as simulated ones, all of that comes once more on a
-    `stained` frame and on a `harder` one.
+    segmentation. A network is surer of frames like those it was trained on than of any others, so
+    each frame comes a second time with `doubtful` circles. And as real caps are not as clean as
+    simulated ones, all of that comes once more on a `stained` frame and on a `harder` one.
     """
     rng, other, deep = (np.random.default_rng(seed) for seed in range(3))
     varied = list(varied_cases(cache, VERIFIER_SEED, "a", VARIED))
@@ -126,8 +120,7 @@ def doubtful(circles: Circles, rng: np.random.Generator) -> Circles:
     """Return the circles of a network less sure of all, and of some much less than of others."""
     less = rng.uniform(0, 4) + rng.normal(0, 2, len(circles))
     score = expit(logit(np.clip(circles.score, 1e-6, 1 - 1e-6)) - less)
-    kept = score >= NET.min_score
-    return Circles(circles.center[kept], circles.radius[kept], score[kept])
+    return Circles(circles.center, circles.radius, score).take(score >= NET.min_score)
 
 
 def labels(case: Case, circles: Circles, order: Ints32) -> Floats:

@@ -41,8 +41,7 @@ MatrixOption = Annotated[
     list[str] | None, typer.Option(metavar="A.B=X,Y", help="compare alternatives with the first")
 ]
 ThresholdOption = Annotated[
-    list[str] | None,
-    typer.Option(metavar="METRIC>=X", help="exit with 3 where missed: 'f>=0.98'"),
+    list[str] | None, typer.Option(metavar="METRIC>=X", help="exit with 3 where missed: 'f>=0.98'")
 ]
 PlaneOption = Annotated[
     str | None,
@@ -246,7 +245,7 @@ def _print(items: Iterable[Any]) -> None:
 
     console = Console(file=sys.stdout, highlight=False, markup=False)
     if not console.is_terminal:
-        console = Console(file=sys.stdout, highlight=False, markup=False, width=200)
+        console.width = 200
     for item in items:
         console.print(item)
         console.print()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
@@ -147,6 +147,8 @@ def perform(request: Request, folder: Path, runner: Runner) -> Judgement:
         evaluations = _judge_files(request)
     else:
         evaluations, code = _judge_graph(request, graph, folder, runner)
+    for evaluation in evaluations:
+        _require_judged(evaluation)
     sections = [_section(evaluation) for evaluation in evaluations]
     for section in sections:
         require_known(thresholds, section.named())
@@ -166,12 +168,8 @@ def _judge_files(request: Request) -> list[Evaluation]:
         for file, truth, name in zip(files, truths, unique_names(files), strict=True)
     ]
     if _same_frames(parts):
-        evaluations = [Evaluation(request.rules, [part], label=part.name) for part in parts]
-    else:
-        evaluations = [Evaluation(request.rules, parts)]
-    for evaluation in evaluations:
-        _require_judged(evaluation)
-    return evaluations
+        return [Evaluation(request.rules, [part], label=part.name) for part in parts]
+    return [Evaluation(request.rules, parts)]
 
 
 def _same_frames(parts: Sequence[Judged]) -> bool:
@@ -237,8 +235,6 @@ def _judge_graph(
         called = name or recording_of(plan.source)
         judged = _judge(request, result_path(plan), truths[number], recording, called)
         evaluations[option.label].recordings.append(judged)
-    for evaluation in evaluations.values():
-        _require_judged(evaluation)
     return list(evaluations.values()), worst
 
 
@@ -272,13 +268,10 @@ def _require_judged(evaluation: Evaluation) -> None:
 def _section(evaluation: Evaluation) -> Section:
     rules, parts = evaluation.rules, evaluation.recordings
     overall = summarise("overall", evaluation.verdicts, rules)
-    single = len(parts) == 1
-    return Section(
-        evaluation,
-        overall,
-        [overall if single else summarise(part.name, part.verdicts, rules) for part in parts],
-        speed_of(part.results for part in parts),
-    )
+    each = [replace(overall, name=parts[0].name)]
+    if len(parts) > 1:
+        each = [summarise(part.name, part.verdicts, rules) for part in parts]
+    return Section(evaluation, overall, each, speed_of(part.results for part in parts))
 
 
 def _compare(base: Evaluation, other: Evaluation) -> Comparison:

@@ -6,13 +6,12 @@ import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.errors import InputError, UsageError
-from mushpipe.core.recording import GARBAGE, Raw, RecordingReader
+from mushpipe.core.recording import GARBAGE, RecordingReader
 from mushpipe.sources.decoding import Decoder
 from mushpipe.sources.mcap import McapSource
 from mushpipe.sources.topics import topic_fault
@@ -126,22 +125,18 @@ def _readings(reader: RecordingReader, topic: str) -> Iterator[tuple[str, tuple[
         raise UsageError(f"{reader.path}: {fault}")
     decoder = Decoder()
     for raw in reader.messages({topic}):
-        message = _decoded(decoder, raw, reader.path)
+        try:
+            message = decoder.decode(raw)
+        except GARBAGE as error:
+            raise InputError(f"{reader.path}: {topic} cannot be decoded: {error}") from error
         read = message.linear_acceleration
         yield message.header.frame_id, (read.x, read.y, read.z)
-
-
-def _decoded(decoder: Decoder, raw: Raw, path: Path) -> Any:
-    try:
-        return decoder.decode(raw)
-    except GARBAGE as error:
-        raise InputError(f"{path}: {raw.channel.topic} cannot be decoded: {error}") from error
 
 
 def _beside_bed(path: Path, up: Floats) -> tuple[float | None, str]:
     """Return the angle, degrees, between an upright and the bed's normal, or why there is none."""
     try:
-        frame = next(iter(McapSource(path=path, max_frames=1).frames()), None)
+        frame = next(McapSource(path=path, max_frames=1).frames(), None)
     except InputError as error:  # a recording of the IMU alone, or one that has to be chosen from
         return None, str(error).removeprefix(f"{path}: ").split(";")[0]
     if frame is None or frame.depth is None:

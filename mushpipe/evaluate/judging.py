@@ -117,11 +117,7 @@ def summarise(name: str, verdicts: Sequence[Verdict], rules: Rules) -> Summary:
 
 
 def judge_results(
-    results: Results,
-    truth: TruthSet,
-    rules: Rules,
-    recording: Path | None = None,
-    name: str = "",
+    results: Results, truth: TruthSet, rules: Rules, recording: Path | None = None, name: str = ""
 ) -> Judged:
     """Judge every frame whose truth is known.
 

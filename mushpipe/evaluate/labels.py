@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from mushpipe.core.arrays import Floats
 from mushpipe.core.truth import Ignore, Truth
 
 Json = dict[str, Any]
@@ -220,10 +221,10 @@ def _reason(ignore: bool | str) -> Ignore:
     return Ignore[ignore.upper().replace("-", "_")]
 
 
-def _numbers(values: list[float | None] | list[float]) -> np.ndarray[Any, np.dtype[np.float64]]:
+def _numbers(values: list[float | None] | list[float]) -> Floats:
     return np.array([math.nan if v is None else v for v in values], dtype=float)
 
 
-def _vectors(values: list[list[float] | None]) -> np.ndarray[Any, np.dtype[np.float64]]:
+def _vectors(values: list[list[float] | None]) -> Floats:
     nothing = [math.nan] * 3
     return np.array([v or nothing for v in values], dtype=float).reshape(-1, 3)

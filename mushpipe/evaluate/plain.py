@@ -22,9 +22,9 @@ def judgement_json(judgement: Judgement) -> str:
     rules = judgement.sections[0].evaluation.rules
     return _dump(
         {
-            "rules": {**asdict(rules), "up": list(rules.up)},
+            "rules": asdict(rules),
             "alternatives": [_section(section) for section in judgement.sections],
-            "differences": [_comparison(item) for item in judgement.comparisons],
+            "differences": [_with_metrics(item) for item in judgement.comparisons],
             "thresholds": [_outcome(label, item) for label, item in judgement.outcomes],
             "damage": judgement.damage,
             "exit_code": judgement.exit_code,
@@ -49,11 +49,10 @@ def _section(section: Section) -> Json:
     parts = zip(section.evaluation.recordings, section.recordings, strict=True)
     return {
         "label": section.label,
-        "overall": _summary(section.overall),
+        "overall": _with_metrics(section.overall),
         "recordings": [
             {
-                **_summary(summary),
-                "name": judged.name,
+                **_with_metrics(summary),
                 "results": str(judged.results.path),
                 "topic": judged.results.topic,
                 "truth": judged.truth.name,
@@ -66,9 +65,10 @@ def _section(section: Section) -> Json:
     }
 
 
-def _summary(summary: Summary) -> Json:
-    content = asdict(summary)
-    return {**{k: v for k, v in content.items() if k != "values"}, "metrics": content["values"]}
+def _with_metrics(item: Summary | Comparison) -> Json:
+    content = asdict(item)
+    content["metrics"] = content.pop("values")
+    return content
 
 
 def _frame(verdict: Verdict) -> Json:
@@ -81,15 +81,6 @@ def _frame(verdict: Verdict) -> Json:
         "missed": len(matching.missed),
         "false": len(matching.false),
         "ignored": len(matching.ignored),
-    }
-
-
-def _comparison(item: Comparison) -> Json:
-    return {
-        "label": item.label,
-        "base": item.base,
-        "frames": item.frames,
-        "metrics": {name: asdict(value) for name, value in item.values.items()},
     }
 
 

@@ -113,8 +113,6 @@ def _single(section: Section) -> Iterator[Titled | Text]:
     rows = [(summary.name, summary) for summary in section.recordings]
     if len(rows) > 1:
         rows.append(("overall", section.overall))
-    elif rows:
-        rows = [(section.evaluation.recordings[0].name, section.overall)]
     yield headline_table("recording", rows)
     if section.overall.found:
         yield error_table(section.overall)

@@ -16,9 +16,8 @@ def speed_of(results: Iterable[Results]) -> dict[str, dict[str, float]]:
     for result in results:
         for stage, durations in result.durations_ms.items():
             pooled.setdefault(stage, []).extend(durations)
-    total = pooled.pop(TOTAL, None)
-    if total is not None:
-        pooled[TOTAL] = total
+    if TOTAL in pooled:  # last
+        pooled[TOTAL] = pooled.pop(TOTAL)
     return {
         stage: {
             "p50_ms": float(np.percentile(durations, 50)),

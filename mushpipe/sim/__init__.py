@@ -6,5 +6,6 @@ z = 0 on the bed, x to the right and y to the top of the image of a camera that 
 down; truth and depth are given in the camera's optical frame (x right, y down, z forward).
 
 Order of the modules: `settings`, `noise`, `mesh`, `shapes`, `mushroom`, `planting`, `ground`,
-`table`, `world`, `render`, `material`, `light`, then `photo`, `sensor`, `annotate`.
+`table`, `raycast`, `world`, `render`, `material`, `light`, then `photo`, `sensor`, `annotate`, and
+with all of them `scene`; `recordings` makes the files that the project carries.
 """

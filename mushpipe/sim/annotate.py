@@ -61,6 +61,11 @@ def outline_around(points: Floats) -> Outline:
     return Outline(hull + middle, abs(float(area)), center + middle)
 
 
+def outline_along(axis: Floats, points: Floats) -> Outline:
+    """Return the outline of points (N, 3) m, seen along a unit axis from infinitely far."""
+    return outline_around(points @ turned_to(axis, 0.0)[:, :2])
+
+
 def annotate(
     world: World, view: View, surface: Surface, largest_px: float
 ) -> tuple[Truth, Instances]:
@@ -75,12 +80,14 @@ def annotate(
     owner = np.where(surface.outlined, surface.owner, -1)
     seen = np.bincount(owner[owner >= 0], minlength=len(world.mushrooms))
     numbers = np.flatnonzero(seen)
-    outlines = [outline_around(_projected(world, view, k)) for k in numbers.tolist()]
     mushrooms = [world.mushrooms[k] for k in numbers]
+    bodies = [world.vertices[world.bodies[k]] for k in numbers]
+    outlines = [outline_around(view.camera.project(view.seen(body))) for body in bodies]
     centers = np.array([o.center for o in outlines]).reshape(-1, 2)
-    area = np.array([o.area for o in outlines])
-    visible = np.minimum(seen[numbers] / area, 1.0) if len(numbers) else area
-    across = [_across(world, k) for k in numbers.tolist()]
+    visible = np.minimum(seen[numbers] / [o.area for o in outlines], 1.0)
+    across = [
+        outline_along(m.axis, body - m.center) for m, body in zip(mushrooms, bodies, strict=True)
+    ]
     size = view.camera.width, view.camera.height
     reasons = [
         reason_of((m.kind == Kind.STUMP, m.axis[2]), o, float(v), size, largest_px)
@@ -101,19 +108,6 @@ def annotate(
     rows = np.zeros(len(world.mushrooms) + 1, np.uint16)
     rows[numbers] = 1 + np.arange(len(numbers))
     return truth, Instances(rows[owner].reshape(surface.shape))
-
-
-def _projected(world: World, view: View, number: int) -> Floats:
-    points = view.seen(world.vertices[world.bodies[number]])
-    return view.camera.project(points)
-
-
-def _across(world: World, number: int) -> Outline:
-    """Return the outline seen along the axis from infinitely far, in m."""
-    mushroom = world.mushrooms[number]
-    frame = turned_to(mushroom.axis, 0.0)
-    points = world.vertices[world.bodies[number]] - mushroom.center
-    return outline_around(points @ frame[:, :2])
 
 
 def reason_of(

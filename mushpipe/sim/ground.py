@@ -37,17 +37,12 @@ class Ground:
     material: Material
     wet: float = 0.0
 
-    def texels(self, points: Reals) -> tuple[Singles, Singles]:
-        """Return the column and row (N,) of points (N, 2) m."""
-        column = (points[:, 0] - self.area.x0) / self.texel
-        row = (self.area.y1 - points[:, 1]) / self.texel
-        return column.astype(np.float32), row.astype(np.float32)
-
     def sample(self, layer: Singles, points: Reals) -> Singles:
         """Interpolate a layer (H, W[, C]) at points (N, 2) m; the border goes on outside."""
         if not len(points):
             return np.zeros((0, *layer.shape[2:]), np.float32)
-        column, row = self.texels(points)
+        column = ((points[:, 0] - self.area.x0) / self.texel).astype(np.float32)
+        row = ((self.area.y1 - points[:, 1]) / self.texel).astype(np.float32)
         # remap holds at most 32767 rows: fold the list of points into a table
         width = min(4096, len(column))
         rest = -len(column) % width
@@ -103,8 +98,8 @@ def soil(
     albedo = (base * np.exp(tone)[..., None] * tilt).astype(np.float32)
     _fibres(albedo, texel, area, rng)
     cover = _mycelium(shape, texel, mycelium, area, rng)
-    white = np.array([0.50, 0.50, 0.48], np.float32)
-    albedo = mix(albedo.reshape(-1, 3), (*white,), cover.ravel()).reshape(albedo.shape)
+    white = (0.50, 0.50, 0.48)
+    albedo = mix(albedo.reshape(-1, 3), white, cover.ravel()).reshape(albedo.shape)
     height = height + 0.0007 * cover
     return Ground(area, texel, height.astype(np.float32), albedo, Material.SOIL)
 

@@ -58,10 +58,6 @@ class Mushroom:
     grain: float = 0.0
     fresh: bool = False
 
-    def rotation(self) -> Floats:
-        """Return the rotation (3, 3) of the cap's own frame in the bed frame."""
-        return turned_to(self.axis, self.spin)
-
 
 def turned_to(axis: Floats, spin: float) -> Floats:
     """Return a rotation (3, 3) that takes +z to a unit axis, after a turn about z by `spin`."""
@@ -108,7 +104,8 @@ def _placed(
     mushroom: Mushroom, profile: tuple[Floats, ...], segments: int, material: Material
 ) -> Mesh:
     rings = shaped(mushroom.shape, profile[0], profile[1], segments) * mushroom.radius
-    return sheet(rings, material).placed(mushroom.rotation(), mushroom.center)
+    rotation = turned_to(mushroom.axis, mushroom.spin)
+    return sheet(rings, material).placed(rotation, mushroom.center)
 
 
 def _stem(mushroom: Mushroom, segments: int) -> list[Mesh]:

@@ -153,8 +153,6 @@ def _part(seats: _Seats, gap: float) -> None:
         step = (offset / flat[..., None] * push[..., None]).sum(axis=1)
         seats.place += 0.6 * step
         seats.lean += step
-    if not len(seats.kind):
-        return
     near = (flat < 1.3 * reach)[..., None]
     seats.lean += 0.15 * (offset * near).sum(axis=1)
 

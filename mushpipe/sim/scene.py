@@ -54,11 +54,7 @@ class Scene:
     """
 
     def __init__(
-        self,
-        settings: SceneSettings,
-        color: ColorCamera,
-        depth: DepthSensor,
-        travel: float = 0.0,
+        self, settings: SceneSettings, color: ColorCamera, depth: DepthSensor, travel: float = 0.0
     ) -> None:
         self._settings, self._color, self._depth = settings, color, depth
         self._world = make_world(settings, travel)

@@ -105,20 +105,19 @@ class DepthSensor(Group):
         lost |= units > np.iinfo(np.uint16).max
         return np.where(lost, 0, np.maximum(units, 0)).astype(np.uint16)
 
-    def _pattern(self, shape: tuple[int, ...], seed: int, rng: np.random.Generator) -> Singles:
+    def _pattern(self, shape: tuple[int, int], seed: int, rng: np.random.Generator) -> Singles:
         """Return noise (H, W) of standard deviation 1, or less where parts are switched off."""
-        size = (shape[0], shape[1])
-        total = np.zeros(size, np.float32)
-        fine = rng.standard_normal(size, np.float32)
-        smooth = blurred(rng, size, 2.0)
+        total = np.zeros(shape, np.float32)
+        fine = rng.standard_normal(shape, np.float32)
+        smooth = blurred(rng, shape, 2.0)
         if self.white:
             total += np.float32(WHITE) * fine
         if self.correlated:
             total += np.float32(CORRELATED) * smooth
         if self.fixed_pattern:
             own = generator(seed, "fixed pattern")
-            total += np.float32(FIXED_FINE) * blurred(own, size, 2.5)
-            total += np.float32(FIXED_WIDE) * blurred(own, size, 25.0)
+            total += np.float32(FIXED_FINE) * blurred(own, shape, 2.5)
+            total += np.float32(FIXED_WIDE) * blurred(own, shape, 25.0)
         return total
 
 
@@ -165,9 +164,8 @@ def _edges(depth: Singles, rng: np.random.Generator) -> tuple[Singles, Bools]:
     return torn.astype(np.float32), edge & (luck > 0.67)
 
 
-def _random_holes(shape: tuple[int, ...], share: float, rng: np.random.Generator) -> Bools:
+def _random_holes(shape: tuple[int, int], share: float, rng: np.random.Generator) -> Bools:
     """Lose a share of the pixels: half of it one by one, half in blobs of a few px."""
-    size = (shape[0], shape[1])
-    single = rng.random(size, np.float32) < share / 2
-    blob = blurred(rng, size, 1.6)
+    single = rng.random(shape, np.float32) < share / 2
+    blob = blurred(rng, shape, 1.6)
     return np.asarray(single | (blob > np.quantile(blob, 1 - share / 2)))

@@ -96,8 +96,10 @@ def clutter(count: int, area: Area, keep: Floats, rng: np.random.Generator) -> l
     for number in range(count):
         spot = area.draw(rng, 1)[0]
         near = len(keep) and float(np.hypot(*(keep - spot).T).min()) < 0.075
-        make = _paper if near or number % 3 == 0 else (_carton, _cup)[rng.integers(2)]
-        thing = make(rng, number)
+        if near or number % 3 == 0:
+            thing = _paper(rng, number)
+        else:
+            thing = (_carton, _cup)[rng.integers(2)](rng)
         turn = rng.uniform(0, 2 * np.pi)
         things.append(thing.placed(about_z(turn), np.array([*spot, 0.0012])))
     return things
@@ -149,14 +151,12 @@ def _paper(rng: np.random.Generator, number: int) -> Mesh:
     return box(size, Material.PAPER)
 
 
-def _carton(rng: np.random.Generator, number: int) -> Mesh:
-    del number
+def _carton(rng: np.random.Generator) -> Mesh:
     return box((*rng.uniform(0.03, 0.11, 2), rng.uniform(0.01, 0.05)), Material.CARDBOARD)
 
 
-def _cup(rng: np.random.Generator, number: int) -> Mesh:
+def _cup(rng: np.random.Generator) -> Mesh:
     """A cup upside down or a bottle top: round and pale, and no mushroom."""
-    del number
     radius, height = rng.uniform(0.010, 0.035), rng.uniform(0.008, 0.06)
     rho = np.array([0, 0.85, 0.92, 1.0, 1.06]) * radius
     z = np.array([1, 1, 0.985, 0.95, 0.0]) * height

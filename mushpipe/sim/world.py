@@ -88,8 +88,7 @@ def view_at(settings: SceneSettings, along: float) -> View:
 
 def area_in_view(settings: SceneSettings, travel: float) -> tuple[Area, float]:
     """Return the part of the bed that comes into view, and its area over one view's area."""
-    camera, reach = settings.camera(), settings.distance / settings.camera().fx
-    x, y = camera.width / 2 * reach, camera.height / 2 * reach
+    x, y = settings.width / 2 * settings.pixel(), settings.height / 2 * settings.pixel()
     y += settings.distance * np.tan(np.radians(settings.camera_tilt_deg)) * 0.5
     area = Area(-x, x + travel, -y, y)
     return area, (2 * x + travel) / (2 * x)
@@ -102,9 +101,8 @@ def make_world(settings: SceneSettings, travel: float = 0.0) -> World:
         DependencyError: open3d or a library of the system is missing.
     """
     view, share = area_in_view(settings, travel)
-    rng = generator(settings.seed, "ground")
-    wide = view.grown(0.16 * settings.distance + 0.01)
-    texel = 0.75 * settings.pixel()
+    rng, pixel = generator(settings.seed, "ground"), settings.pixel()
+    wide, texel = view.grown(0.16 * settings.distance + 0.01), 0.75 * pixel
     if settings.scene == "bed":
         base = grounds.soil(wide, texel, settings.soil, settings.mycelium, rng)
         if settings.relief_mm or settings.wet:
@@ -117,9 +115,7 @@ def make_world(settings: SceneSettings, travel: float = 0.0) -> World:
     mushrooms = _mushrooms(settings, view, share, base)
     things = _things(settings, view, share, base, mushrooms, rng)
     step = 3.4 if settings.scene == "bed" else 6.0
-    return assemble(
-        base, mushrooms, [base.mesh(step * settings.pixel()), *things], settings.pixel()
-    )
+    return assemble(base, mushrooms, [base.mesh(step * pixel), *things], pixel)
 
 
 def _mushrooms(settings: SceneSettings, view: Area, share: float, base: Ground) -> list[Mushroom]:

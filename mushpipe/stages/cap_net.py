@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from importlib import resources
-from pathlib import Path
-from typing import Annotated, Self
+from typing import Self
 
 import cv2
 import numpy as np
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import Field, PositiveFloat, PrivateAttr, model_validator
 
 from mushpipe import Circles, GraphPath, Header, Mask, RgbdFrame, Stage
 from mushpipe.core.arrays import Bools, Bytes, Floats, Singles, locked
@@ -25,6 +23,7 @@ from mushpipe.stages.discs import (
     many_likely,
 )
 from mushpipe.stages.letterbox import resized
+from mushpipe.stages.verifier import package_file
 
 FILE = "cap_net.onnx"
 KIND = "mushpipe cap-net 1"  # what the model's own metadata call it
@@ -42,9 +41,6 @@ _WIDTH, _LARGE = 640, 45.0
 _CLEARLY = 1.25  # so much more of the image circles at another scale must explain
 
 
-Positive = Annotated[float, Field(gt=0)]
-
-
 class CapNet(Stage):
     """Detects caps in colour with a network of 161 000 parameters, trained on simulated beds.
 
@@ -53,7 +49,7 @@ class CapNet(Stage):
     large caps can be in the image.
     """
 
-    radius_px: tuple[Positive, Positive | None] = Field(
+    radius_px: tuple[PositiveFloat, PositiveFloat | None] = Field(
         (8, 45),
         description="smallest and largest radius, px; circles may be a tenth beyond; the image is "
         "scaled to suit. [8, null]: what largest_mm is at the depth that is seen, 60 px or more; "
@@ -100,13 +96,12 @@ class CapNet(Stage):
         """Return the model; raises as `open` does."""
         if self._net is not None:
             return self._net
-        path = self.model or Path(str(resources.files("mushpipe.stages") / FILE))
-        net = OnnxFile(path)
+        net = OnnxFile(self.model or package_file(FILE))
         kind = net.metadata.get("kind")
         if kind != KIND:
             raise UsageError(
-                f"model {path}: it calls itself {kind!r}, expected {KIND!r} as `make train` writes "
-                "it; for a model of your own use the stage `onnx`"
+                f"model {net.path}: it calls itself {kind!r}, expected {KIND!r} as `make train` "
+                "writes it; for a model of your own use the stage `onnx`"
             )
         self._net = net
         return net

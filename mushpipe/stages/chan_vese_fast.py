@@ -231,12 +231,7 @@ def _cost(planes: Singles, u: Bytes, mu: float, c1: Floats, c2: Floats, known: b
     return _means(planes, u, c1, c2, known)[1] + mu * _length(u)
 
 
-def solve_fast(
-    image: Singles,
-    initial: Bools,
-    mu: float,
-    levels: Levels | None = None,
-) -> Bools:
+def solve_fast(image: Singles, initial: Bools, mu: float, levels: Levels | None = None) -> Bools:
     """Minimise the Chan-Vese energy from an initial region.
 
     Args:

@@ -60,7 +60,7 @@ def light_field(gray: Singles, iterations: int) -> Singles:
         return np.zeros(gray.shape, np.float32)
     u = otsu_foreground((detail - low) / (high - low)).ravel()
     weight = np.asarray(gray / (gray + _DIM), np.float64).ravel() + 1e-3
-    field = _fit(h.ravel().astype(np.float64), weight, basis, u.copy(), iterations)
+    field = _fit(h.ravel().astype(np.float64), weight, basis, u, iterations)
     return np.asarray((field - field.mean()).reshape(gray.shape), np.float32)
 
 

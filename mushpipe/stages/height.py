@@ -58,8 +58,8 @@ class Height(Stage):
 
 def without_crumbs(region: Bools, diameter: float) -> Bools:
     """Return a region without the pieces of a smaller area than a disc of the diameter (px)."""
-    count, label, stats, _ = cv2.connectedComponentsWithStats(region.view(np.uint8))
-    keep = stats[:count, cv2.CC_STAT_AREA] >= np.pi / 4 * diameter**2
+    _, label, stats, _ = cv2.connectedComponentsWithStats(region.view(np.uint8))
+    keep = stats[:, cv2.CC_STAT_AREA] >= np.pi / 4 * diameter**2
     keep[0] = False
     return np.asarray(keep[label])
 

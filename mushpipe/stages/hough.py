@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Literal, Self
 
 import cv2
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, PositiveFloat, model_validator
 
 from mushpipe import Circles, Mask, RgbdFrame, Stage
 from mushpipe.core.arrays import Bools, Floats, Rows, Singles
-
-Radius = Annotated[float, Field(gt=0)]
 
 
 class _Peer(Stage):
     """What the peers share: their input, and which of their circles are kept."""
 
     input: Literal["image", "mask"] = Field("image", description="where the edges are taken from")
-    radius_px: tuple[Radius, Radius] = Field((8, 38), description="smallest and largest radius, px")
+    radius_px: tuple[PositiveFloat, PositiveFloat] = Field(
+        (8, 38), description="smallest and largest radius, px"
+    )
     apart: float = Field(
         0.7, ge=0, description="smallest distance of two centres, in radii of the larger circle"
     )

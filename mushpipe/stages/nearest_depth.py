@@ -48,13 +48,12 @@ class NearestDepth(Stage):
         depth.flags.writeable = False
         discs = discs_of(circles)
         position, source = self._positions(depth, camera, discs)
-        return Locations(
+        return Locations.unknown(
+            n,
             position=position,
             distance=lengths(position),
             diameter=_diameters(depth, camera, discs),
             source=source,
-            sigma_position=np.full((n, 3), np.nan),
-            sigma_diameter=np.full(n, np.nan),
         )
 
     def _positions(self, depth: Singles, camera: Camera, discs: Floats) -> tuple[Floats, Bytes]:

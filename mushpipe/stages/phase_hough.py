@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal, Self
 
 import cv2
 import numpy as np
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import Field, PositiveFloat, PrivateAttr, model_validator
 
 from mushpipe import Circles, Mask, RgbdFrame, Stage, UsageError
 from mushpipe.core.arrays import Bools, Bytes, Floats, Ints32, Singles
@@ -35,11 +35,9 @@ from mushpipe.stages.phase.polish import polish
 from mushpipe.stages.phase.refit import refit
 from mushpipe.stages.phase.strips import Strips, in_strips
 from mushpipe.stages.phase.verifier import load_verifier
-from mushpipe.stages.phase.votes import CELL, centres
+from mushpipe.stages.phase.votes import centres
 from mushpipe.stages.verifier_net import Models
 from mushpipe.stages.warm_up import example_circles, example_frame
-
-Positive = Annotated[float, Field(gt=0)]
 
 _FLOOR = 4.0  # gray levels per px; Otsu's threshold of an image without edges is noise
 _AROUND = np.ones((7, 7), np.uint8)  # edges are taken so far around the foreground
@@ -95,13 +93,13 @@ class PhaseHough(Stage):
     input: Literal["image", "mask"] = Field(
         "image", description="where edges are taken from; `mask` is the paper's variant, no depth"
     )
-    radius_px: tuple[Positive, Positive | None] | None = Field(
+    radius_px: tuple[PositiveFloat, PositiveFloat | None] | None = Field(
         (8.0, 38.0),
         description="smallest and largest radius looked for, px; outlines may be fitted a tenth "
         "beyond; null takes them from diameter_mm and depth. [8, null]: 80 px, or more where a cap "
         "of diameter_mm is larger at the depth that is seen, or one that is learned",
     )
-    diameter_mm: tuple[Positive, Positive] = Field(
+    diameter_mm: tuple[PositiveFloat, PositiveFloat] = Field(
         (6.0, 120.0), description="smallest and largest diameter, mm, where there is depth"
     )
     min_score: float = Field(0.5, ge=0, le=1, description="smallest score that is kept")
@@ -252,7 +250,7 @@ class PhaseHough(Stage):
         smallest, largest = self.radius_px or (8.0, 38.0)
         if largest is None:
             by_depth = self.diameter_mm[1] / 2000 / relief.pixel if relief.known else 0
-            largest = max(_LARGE, by_depth, largest_of(learned, LIKELY))
+            largest = max(_LARGE, by_depth, largest_of(learned))
         if self.radius_px is None and relief.known:
             # a cap is nearer than the bed, hence larger in the image
             near = relief.bed_pixel(*np.array([(0, width, 0, width), (0, 0, height, height)]))
@@ -265,7 +263,7 @@ class PhaseHough(Stage):
         otsu = max(otsu_of(gradient.size), _FLOOR)
         edges, pixels = edges_of(image, gradient, region, self.edge * otsu, 1.2 * otsu)
         if relief.known:
-            edges = fused(edges, pixels, relief.edges(), CELL)
+            edges = fused(edges, pixels, relief.edges())
         return in_strips(edges, *image.shape)
 
     def _plausible(self, shapes: Floats, middle: Floats, relief: Relief) -> Bools:

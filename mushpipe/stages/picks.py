@@ -111,11 +111,7 @@ class MakePicks(Stage):
         Tracks().update(two, unknown, (8, 8), 0, 0)
 
     def process(
-        self,
-        frame: RgbdFrame,
-        circles: Circles,
-        locations: Locations,
-        poses: Poses | None = None,
+        self, frame: RgbdFrame, circles: Circles, locations: Locations, poses: Poses | None = None
     ) -> Picks:
         """Return the picks, the first to pick first, in the robot's frame or the camera's.
 
@@ -133,16 +129,10 @@ class MakePicks(Stage):
         poses = self._outward(poses, locations, frame.header.sequence)
         self._total += n
         self._missing += int(locations.missing.sum())
-        height, width = frame.color.shape[:2]
-        ids = self._tracks.update(
-            circles,
-            locations,
-            (width, height),
-            frame.header.stamp_ns,
-            round(self.memory_s * 1e9),
-        )
-        hidden = hidden_share(circles, locations.distance, (width, height))
-        flags = self._flags((width, height), circles, locations, poses, hidden)
+        image, memory_ns = frame.color.shape[1::-1], round(self.memory_s * 1e9)
+        ids = self._tracks.update(circles, locations, image, frame.header.stamp_ns, memory_ns)
+        hidden = hidden_share(circles, locations.distance, image)
+        flags = self._flags(image, circles, locations, poses, hidden)
         picks = _joined(ids, circles, locations, poses, flags, frame.header.frame_id)
         up = -locations.position[:, 2]
         if self.T_base_camera is not None:

@@ -8,15 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, PrivateAttr
 
-from mushpipe import (
-    Circles,
-    GraphPath,
-    Locations,
-    Poses,
-    RgbdFrame,
-    Stage,
-    quaternion_from_axis,
-)
+from mushpipe import Circles, GraphPath, Locations, Poses, RgbdFrame, Stage, quaternion_from_axis
 from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.libraries import import_open3d
 from mushpipe.stages.calibrated import calibration_of
@@ -259,13 +251,7 @@ def _cloud(o3d: Any, points: Floats, normals: Floats | None) -> Any:
     return cloud
 
 
-def _inside(
-    depth: Singles,
-    rays: Singles,
-    center: Floats,
-    radius: float,
-    size: float,
-) -> Floats:
+def _inside(depth: Singles, rays: Singles, center: Floats, radius: float, size: float) -> Floats:
     """Return the points (M, 3) m in a circle (px), within the depth a cap of that size spans."""
     height, width = depth.shape
     (left, top), (right, bottom) = (

@@ -55,8 +55,8 @@ def _revolved(rho: Floats, z: Floats, spacing: float) -> tuple[Floats, Floats]:
     length = np.concatenate([[0], np.cumsum(np.hypot(np.diff(rho), np.diff(z)))])
     at = np.arange(spacing / 2, length[-1], spacing)
     radius, height = np.interp(at, length, rho), np.interp(at, length, z)
-    d_rho = np.interp(at, length, np.gradient(rho, length + np.arange(len(length)) * 1e-12))
-    d_z = np.interp(at, length, np.gradient(z, length + np.arange(len(length)) * 1e-12))
+    apart = length + np.arange(len(length)) * 1e-12  # no two points in one place
+    d_rho, d_z = (np.interp(at, length, np.gradient(part, apart)) for part in (rho, z))
     points: list[Floats] = []
     normals: list[Floats] = []
     for r, h, dr, dz in zip(radius, height, d_rho, d_z, strict=True):

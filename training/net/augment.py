@@ -102,11 +102,7 @@ def aims(circles: Floats, unsure: Bools, cells: int) -> tuple[Singles, Singles]:
 
 
 def photographed(
-    image: Singles,
-    cap: Singles,
-    rng: np.random.Generator,
-    stained: bool = False,
-    blurred: bool = False,
+    image: Singles, cap: Singles, rng: np.random.Generator, stained: bool, blurred: bool
 ) -> Singles:
     """Return an image (H, W, 3) with other colours, light, blur, noise and things before it."""
     if rng.random() < 0.4:  # other caps on the same bed

@@ -51,7 +51,7 @@ EACH, VARIED = 3, 16  # frames of a row per shape family, and of `varied`
 TABLES = 4  # times as many frames of a table, which holds few caps
 
 
-def scenes(cache: Path, choosing: bool, each: int = EACH, varied: int = VARIED) -> Iterator[Case]:
+def scenes(cache: Path, choosing: bool, each: int, varied: int) -> Iterator[Case]:
     """Yield the frames to judge on, so many per row and family, or those for choices of design."""
     if choosing:
         return chain(choosing_cases(cache), varied_cases(cache, CHOOSING_SEED, "a", 60))

@@ -140,7 +140,7 @@ def picture(seed: int, cache: Path) -> Picture:
 
 
 def _render(seed: int, path: Path) -> None:
-    frame = next(iter(SyntheticSource(**settings(seed)).frames()))
+    frame = next(SyntheticSource(**settings(seed)).frames())
     truth, instances = frame.attached[TRUTH_TOPIC], frame.attached[INSTANCES_TOPIC]
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_suffix(".part.npz")

@@ -117,7 +117,8 @@ def _shape(mi: Any, bed: Bed, mesh: Mesh, surface: Any) -> Any:
 def _lamps(bed: Bed, rng: np.random.Generator) -> dict[str, Any]:
     """Return the lamps over a bed: a pair of bars, a ring around the camera, a low bar, a spot."""
     tint = np.array([1, rng.uniform(0.85, 1), rng.uniform(0.65, 1.1)])
-    lamps: dict[str, Any] = {"sky": _sky(rng.uniform(0.05, 0.5) * tint)}
+    even = {"type": "rgb", "value": (rng.uniform(0.05, 0.5) * tint).tolist()}
+    lamps: dict[str, Any] = {"sky": {"type": "constant", "radiance": even}}
     kind = rng.choice(["bars", "ring", "low", "spot"], p=[0.4, 0.25, 0.2, 0.15])
     across, height = bed.distance * rng.uniform(0.5, 1.0), bed.distance * rng.uniform(0.7, 1.3)
     turn = rng.uniform(0, 2 * np.pi)
@@ -142,7 +143,3 @@ def _lamps(bed: Bed, rng: np.random.Generator) -> dict[str, Any]:
             "emitter": {"type": "area", "radiance": glow},
         }
     return lamps
-
-
-def _sky(color: Floats) -> dict[str, Any]:
-    return {"type": "constant", "radiance": {"type": "rgb", "value": color.tolist()}}

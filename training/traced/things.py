@@ -90,8 +90,7 @@ def _skin(points: Floats, color: str, rng: np.random.Generator) -> Floats:
     light, dark = (np.array(c) for c in CAP_COLORS[color])
     colors = np.tile(light, (len(points), 1)) * rng.uniform(0.8, 1.05)
     colors = mixed(colors, dark, 0.25 + 0.2 * waves(points, 0.012, rng))
-    scaly = rng.random() < (0.5 if color == "brown" else 0.25)
-    if scaly:
+    if rng.random() < (0.5 if color == "brown" else 0.25):
         share = (waves(points, 0.0016, rng) - 0.6) * rng.uniform(0.3, 1.2)
         colors = mixed(colors, dark, share)
     if rng.random() < 0.4:

@@ -7,8 +7,7 @@ import numpy as np
 from mushpipe import Camera
 from mushpipe.core.arrays import Floats
 from mushpipe.core.truth import Truth
-from mushpipe.sim.annotate import outline_around, reason_of
-from mushpipe.sim.mushroom import turned_to
+from mushpipe.sim.annotate import outline_along, outline_around, reason_of
 from training.traced.bed import Bed, Mushroom
 from training.traced.mesh import Mesh
 from training.traced.render import View, seen
@@ -22,7 +21,7 @@ def truth_of(bed: Bed, view: View, camera: Camera) -> Truth:
     numbers = np.flatnonzero(pixels)
     grown = [bed.mushrooms[k] for k in numbers]
     outlines = [outline_around(camera.project(seen(bed, m.skin.vertices))) for m in grown]
-    across = [outline_around(_along_axis(m)) for m in grown]
+    across = [outline_along(m.axis, m.skin.vertices - m.position) for m in grown]
     visible = np.minimum(1, pixels[numbers] / [o.area for o in outlines])
     size = camera.width, camera.height
     reasons = [
@@ -43,12 +42,6 @@ def truth_of(bed: Bed, view: View, camera: Camera) -> Truth:
         np.array([o.extent() for o in across]),
         np.array(reasons, np.uint8),
     )
-
-
-def _along_axis(mushroom: Mushroom) -> Floats:
-    """Return the skin (V, 2) m as seen along the axis from infinitely far."""
-    points = mushroom.skin.vertices - mushroom.position
-    return np.asarray(points @ turned_to(mushroom.axis, 0.0)[:, :2])
 
 
 def _apex(bed: Bed, mushroom: Mushroom) -> Floats:

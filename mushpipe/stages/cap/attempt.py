@@ -120,12 +120,7 @@ def scratch(height: int, width: int) -> Room:
 
 @borrower
 def gather(
-    image: Image,
-    circle: Floats,
-    rank: int,
-    sensor: Sensor,
-    room: Room,
-    rays: Singles,
+    image: Image, circle: Floats, rank: int, sensor: Sensor, room: Room, rays: Singles
 ) -> tuple[int, int, int, float]:
     """Take the rays of a cap; return what there is of it.
 

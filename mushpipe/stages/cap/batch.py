@@ -239,13 +239,7 @@ def describe(fit: Fit, covariance: Floats, cut: float, told: Floats) -> None:
         told[APEX + i] = cap[i] + height * cap[N + i]
 
 
-def fit_caps(
-    frame: Frame,
-    circles: Floats,
-    rank: Ints,
-    habit: Habit,
-    settings: Settings,
-) -> Fits:
+def fit_caps(frame: Frame, circles: Floats, rank: Ints, habit: Habit, settings: Settings) -> Fits:
     """Fit a cap to the depth in each circle.
 
     Args:

@@ -46,12 +46,7 @@ def circle_around(circle: Floats, reach: Singles) -> Vector:
 
 @borrower
 def improve(
-    circle: Floats,
-    cap: Floats,
-    held: tuple[float, float],
-    doubt: float,
-    image: Image,
-    room: Lanes,
+    circle: Floats, cap: Floats, held: tuple[float, float], doubt: float, image: Image, room: Lanes
 ) -> None:
     """Move a circle (3,) x, y, radius, px, towards the outline of its cap, in place.
 

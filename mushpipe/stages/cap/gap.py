@@ -14,6 +14,7 @@ import numpy as np
 
 from mushpipe import Circles, RgbdFrame
 from mushpipe.core.arrays import Bools, Floats, Singles
+from mushpipe.stages.calibrated import calibration_of
 
 logger = logging.getLogger("mushpipe")
 
@@ -117,7 +118,7 @@ class EdgeWatch:
             _tell_strange(self._places, self._confirmed)
             return
         self.amiss_px = float(np.hypot(np.hypot(*found[1:]), found[0] + stated))
-        _tell(found, stated, unsure)
+        _tell_amiss(found, stated, unsure)
 
 
 def _tell_strange(places: int, confirmed: int) -> None:
@@ -142,7 +143,7 @@ def _amiss(found: Floats, stated: float, unsure: float) -> tuple[bool, bool]:
     return bool(shifted), bool(abs(found[0] + stated) > AMISS + unsure)
 
 
-def _tell(found: Floats, stated: float, unsure: float) -> None:
+def _tell_amiss(found: Floats, stated: float, unsure: float) -> None:
     """Warn of what is amiss; arguments as `_amiss`."""
     shifted, wider = _amiss(found, stated, unsure)
     if shifted:
@@ -205,7 +206,7 @@ def edge_gaps(frame: RgbdFrame, circles: Circles) -> tuple[Floats, int]:
     """Return by how much edges in depth lie outside of those in colour, and where (K, 3).
 
     Distance, px, and direction from the centre, x and y of a unit vector. Looked for along 32
-    directions across the largest circles, where all of the depth is known.
+    directions across the circles, where all of the depth is known.
 
     Args:
         frame: With depth and calibration.
@@ -214,15 +215,12 @@ def edge_gaps(frame: RgbdFrame, circles: Circles) -> tuple[Floats, int]:
     Returns:
         These, and at how many places colour shows an edge, whether or not depth does.
     """
-    if frame.camera is None:
-        raise ValueError("a frame without calibration")
-    large = _large(circles)
-    if not len(large):
+    if not len(circles):
         return np.zeros((0, 3)), 0
-    depth = np.nan_to_num(frame.depth_m)
+    depth, fx = np.nan_to_num(frame.depth_m), calibration_of(frame).fx
     found = [
-        _gaps(frame.gray, depth, frame.camera.fx, center, float(radius))
-        for center, radius in zip(large.center, large.radius, strict=True)
+        _gaps(frame.gray, depth, fx, center, float(radius))
+        for center, radius in zip(circles.center, circles.radius, strict=True)
     ]
     gaps, places = zip(*found, strict=True)
     return np.concatenate(gaps), sum(places)

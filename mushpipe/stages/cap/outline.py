@@ -41,13 +41,7 @@ Lanes = tuple[Singles, Ints32]  # (LANES_ROOM,) and (2 DIRECTIONS,)
 
 
 @borrower
-def expected_reach(
-    cap: Floats,
-    image: Image,
-    circle: Floats,
-    row: Singles,
-    pixels: Ints32,
-) -> None:
+def expected_reach(cap: Floats, image: Image, circle: Floats, row: Singles, pixels: Ints32) -> None:
     """Fill how far (DIRECTIONS,), px, the outline of a cap lies from the centre of a circle.
 
     Two steps, each by how far outside of the outline the ray of the place found so far passes.

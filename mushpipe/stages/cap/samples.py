@@ -47,12 +47,7 @@ EAST, SOUTH = np.cos(_TURN).astype(np.float32), np.sin(_TURN).astype(np.float32)
 
 @borrower
 def sample_depth(
-    window: Window,
-    cut: Cut,
-    image: Image,
-    circle: Floats,
-    sensor: Sensor,
-    out: Singles,
+    window: Window, cut: Cut, image: Image, circle: Floats, sensor: Sensor, out: Singles
 ) -> tuple[int, int, float]:
     """Take the points of a cap: block means on a grid inside its circle, gated around its depth.
 

@@ -11,7 +11,7 @@ from dataclasses import fields
 import numpy as np
 
 from mushpipe import Camera
-from mushpipe.core.arrays import Bools, Floats
+from mushpipe.core.arrays import Floats
 from mushpipe.stages.cap.batch import Fits
 from mushpipe.stages.rows import LOCATION_WITHIN, POSE_WITHIN, apart
 
@@ -26,14 +26,9 @@ def drop_unseen(fits: Fits, circles: Floats, camera: Camera) -> None:
     """
     unseen = np.zeros(len(circles), np.bool_)
     for points, within in ((fits.surface, LOCATION_WITHIN), (fits.apex, POSE_WITHIN)):
-        unseen |= _unseen(points, fits.circle, camera, within)
+        away = apart(camera.project(points), fits.circle[:, :2], fits.circle[:, 2], within)
+        unseen |= (points[:, 2] <= 0) | away
     for field in fields(fits):
         values = getattr(fits, field.name)
         values[unseen] = np.nan if values.dtype.kind == "f" else 0
     fits.circle[unseen] = circles[unseen]
-
-
-def _unseen(points: Floats, circles: Floats, camera: Camera, within: float) -> Bools:
-    """Return which points (N, 3) lie behind the camera, or so many radii beside their circles."""
-    away = apart(camera.project(points), circles[:, :2], circles[:, 2], within)
-    return np.asarray((points[:, 2] <= 0) | away)

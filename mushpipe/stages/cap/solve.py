@@ -8,13 +8,7 @@ import numpy as np
 
 from mushpipe.core.arrays import Floats, Singles
 from mushpipe.core.jit import borrower, jit
-from mushpipe.stages.cap.linear import (
-    cholesky,
-    invert_factor,
-    multiply,
-    substitute,
-    tukey,
-)
+from mushpipe.stages.cap.linear import cholesky, invert_factor, multiply, substitute, tukey
 from mushpipe.stages.cap.model import (
     BULGE,
     E1,

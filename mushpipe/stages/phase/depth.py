@@ -130,11 +130,11 @@ class Relief(NamedTuple):
 
     def edges(self) -> Edges:
         """Return the depth discontinuities, in px of the height map."""
-        known = np.maximum(self.filled, 0)
-        edges = depth_edges(known, STEEP * CELL * self.pixel)
+        edges = depth_edges(np.maximum(self.filled, 0), STEEP * CELL * self.pixel)
+        bottom, right = (size - 1 for size in self.filled.shape)
         # Where depth ends, nothing is known to lie lower.
-        u = np.rint(edges.x - 2.5 * edges.nx).astype(int).clip(0, known.shape[1] - 1)
-        v = np.rint(edges.y - 2.5 * edges.ny).astype(int).clip(0, known.shape[0] - 1)
+        u = np.rint(edges.x - 2.5 * edges.nx).astype(int).clip(0, right)
+        v = np.rint(edges.y - 2.5 * edges.ny).astype(int).clip(0, bottom)
         real = self.filled[v, u] != -1
         return Edges(*(column[real] for column in edges))
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from mushpipe.core.arrays import Bools, Ints32, Singles
 from mushpipe.core.jit import jit
+from mushpipe.stages.phase.depth import CELL
 from mushpipe.stages.phase.edges import DEPTH_ALONE, Edges
 
 REACH = 3  # px; so far a gray edge may lie from its depth edge
@@ -43,7 +44,7 @@ def confirm(depth: Edges, gray: Edges, pixels: Ints32, trust: Singles) -> Bools:
     return alone
 
 
-def fused(gray: Edges, pixels: Ints32, depth: Edges, scale: float) -> Edges:
+def fused(gray: Edges, pixels: Ints32, depth: Edges) -> Edges:
     """Return gray edges, and the depth edges that lie where there is no gray one.
 
     A gray edge without a depth edge beside it may be a shadow, dirt or shading: it weighs less.
@@ -51,12 +52,11 @@ def fused(gray: Edges, pixels: Ints32, depth: Edges, scale: float) -> Edges:
     Args:
         gray: Edges of the image.
         pixels: (H, W) row of the gray edge at a pixel, -1 for none.
-        depth: Edges of a height map.
-        scale: Size of a pixel of the height map in image pixels.
+        depth: Edges of a height map, in its pixels.
     """
     half = np.float32(0.5)
-    x = (depth.x + half) * np.float32(scale) - half - np.float32(DEPTH_OUTWARD) * depth.nx
-    y = (depth.y + half) * np.float32(scale) - half - np.float32(DEPTH_OUTWARD) * depth.ny
+    x = (depth.x + half) * np.float32(CELL) - half - np.float32(DEPTH_OUTWARD) * depth.nx
+    y = (depth.y + half) * np.float32(CELL) - half - np.float32(DEPTH_OUTWARD) * depth.ny
     raised = gray._replace(weight=gray.weight * np.float32(UNCONFIRMED))
     placed = depth._replace(x=x, y=y)
     alone = confirm(placed, raised, pixels, gray.weight)

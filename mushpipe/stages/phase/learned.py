@@ -13,6 +13,7 @@ from mushpipe.stages.cap.clod import ODD, darker, ground_of, off_ground
 from mushpipe.stages.cap.kin import FEWEST, SURE, alike, tones_of
 from mushpipe.stages.discs import (
     LEAST_OF_RANGE,
+    LIKELY,
     MOST_OF_RANGE,
     Radii,
     certain_first,
@@ -37,11 +38,11 @@ def of_radii(learned: Circles, radii: Radii) -> Circles:
     return learned.take(enough & (learned.radius <= MOST_OF_RANGE * radii.largest))
 
 
-def largest_of(learned: Circles | None, least: float) -> float:
-    """Return the largest radius, px, and a tenth, of circles of such a score; 0 without any."""
+def largest_of(learned: Circles | None) -> float:
+    """Return the largest radius, px, and a tenth, of circles that are likely caps; 0 without."""
     if learned is None:
         return 0.0
-    return float(MOST_OF_RANGE * learned.radius[learned.score >= least].max(initial=0.0))
+    return float(MOST_OF_RANGE * learned.radius[learned.score >= LIKELY].max(initial=0.0))
 
 
 def candidates_of(learned: Circles) -> Singles:

@@ -45,11 +45,7 @@ class Rings(NamedTuple):
 
 
 def centres(
-    edges: Strips,
-    radii: Radii,
-    shape: tuple[int, int],
-    least: float,
-    every: int = 1,
+    edges: Strips, radii: Radii, shape: tuple[int, int], least: float, every: int = 1
 ) -> Singles:
     """Return likely circles (N, 4): x, y, radius in px, and the share of the outline that voted.
 
