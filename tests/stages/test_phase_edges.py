@@ -89,7 +89,7 @@ def test_a_depth_edge_confirms_the_gray_one_beside_it_and_stands_where_there_is_
     turned = column(25.0, range(34, 38), -1.0, 0.6)  # rows 68 to 74
     beyond = column(59.7, range(10, 12), -1.0, 0.6)
     every = Edges(*map(np.concatenate, zip(depth, away, turned, beyond, strict=True)))
-    both = fused(gray, pixels, every, 2.0)
+    both = fused(gray, pixels, every)
     assert (gray.weight == np.float32(0.9)).all()
     assert both.x[:60].tolist() == [50] * 60
     assert both.weight[20 - 20 : 48 - 20] == pytest.approx(np.full(28, 0.9))
@@ -107,7 +107,7 @@ def test_a_depth_edge_confirms_the_gray_one_beside_it_and_stands_where_there_is_
 def test_beside_a_gray_edge_that_tells_less_the_depth_edge_stays(trust: float) -> None:
     gray, pixels = column(50, range(20, 40), 1.0, trust), np.full((100, 120), -1, np.int32)
     pixels[20:40, 50] = np.arange(20)
-    both = fused(gray, pixels, column(24.5, range(11, 19), 1.0, 0.6), 2.0)
+    both = fused(gray, pixels, column(24.5, range(11, 19), 1.0, 0.6))
     assert len(both.x) == 20 + (8 if trust < 0.6 else 0)
 
 
@@ -117,4 +117,4 @@ def test_one_gray_edge_that_tells_more_is_enough(first: float) -> None:
     gray = Edges(*map(np.concatenate, zip(left, right, strict=True)))
     pixels = np.full((100, 120), -1, np.int32)
     pixels[20:40, 49], pixels[20:40, 51] = np.arange(20), np.arange(20, 40)
-    assert len(fused(gray, pixels, column(24.5, range(11, 19), 1.0, 0.6), 2.0).x) == 40
+    assert len(fused(gray, pixels, column(24.5, range(11, 19), 1.0, 0.6)).x) == 40
