@@ -53,7 +53,10 @@ class RecordedSource(Source):
     camera_topic: str | None = Field(None, description="calibration of the colour images")
     use_depth: bool = Field(True, description="false plays colour only")
     depth_scale: float | None = Field(
-        None, gt=0, description="metres per unit of depth, where the recording does not say it"
+        None,
+        ge=1e-9,
+        le=1,
+        description="metres per unit of depth, where the recording does not say it",
     )
     pair_tolerance_ms: float = Field(
         15.0,

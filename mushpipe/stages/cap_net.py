@@ -42,7 +42,7 @@ _WIDTH, _LARGE = 640, 45.0
 _CLEARLY = 1.25  # so much more of the image circles at another scale must explain
 
 
-Positive = Annotated[float, Field(gt=0)]
+Radius = Annotated[float, Field(gt=0, le=10_000)]
 
 
 class CapNet(Stage):
@@ -53,7 +53,7 @@ class CapNet(Stage):
     large caps can be in the image.
     """
 
-    radius_px: tuple[Positive, Positive | None] = Field(
+    radius_px: tuple[Radius, Radius | None] = Field(
         (8, 45),
         description="smallest and largest radius, px; circles may be a tenth beyond; the image is "
         "scaled to suit. [8, null]: what largest_mm is at the depth that is seen, 60 px or more; "

@@ -39,7 +39,7 @@ from mushpipe.stages.phase.votes import CELL, centres
 from mushpipe.stages.verifier_net import Models
 from mushpipe.stages.warm_up import example_circles, example_frame
 
-Positive = Annotated[float, Field(gt=0)]
+Positive = Annotated[float, Field(ge=0.001)]
 
 _FLOOR = 4.0  # gray levels per px; Otsu's threshold of an image without edges is noise
 _AROUND = np.ones((7, 7), np.uint8)  # edges are taken so far around the foreground
@@ -106,7 +106,7 @@ class PhaseHough(Stage):
     )
     min_score: float = Field(0.5, ge=0, le=1, description="smallest score that is kept")
     edge: float = Field(
-        0.25, gt=0, le=2, description="least gradient, in units of Otsu's threshold of gradients"
+        0.25, ge=0.01, le=2, description="least gradient, in units of Otsu's threshold of gradients"
     )
     evidence: Annotated[float, Field(ge=0.01, le=1)] | None = Field(
         None,

@@ -641,3 +641,42 @@ def test_numbers_may_begin_with_their_point() -> None:
     text = "a: [-.1, +.5, .2, -.5e-1, .5E2, -.inf]\nb: [.e, -., .1e, -.1.2]\n"
     data = parse_document(text, "g.yaml", Path()).data
     assert data == {"a": [-0.1, 0.5, 0.2, -0.05, 50, -math.inf], "b": [".e", "-.", ".1e", "-.1.2"]}
+
+
+@pytest.mark.parametrize(
+    ("use", "setting", "value"),
+    [
+        ("phase-hough", "edge", 1e-300),  # these two wrote beyond an array: the program crashed
+        ("phase-hough", "radius_px", "[1.0e-323, 38]"),
+        ("chan-vese", "iterations", 10**20),  # these three ran for ever
+        ("chan-vese", "smoothing", 10**20),
+        ("hough-skimage", "sigma", 1e5),
+        ("hough", "min_distance_px", 1e5),  # these two took all memory
+        ("cap-net", "radius_px", "[16, 1.0e+15]"),
+        ("hough", "radius_px", "[8, 1.0e+30]"),  # the others overflowed in the run
+        ("hough", "apart", 1e308),
+        ("chan-vese", "mu", 1e30),
+        ("flatten", "iterations", 10**20),
+        ("surface-fit", "circle_sigma_px", 1e300),
+        ("height", "min_mm", 1e-300),
+        ("height", "max_mm", 1e300),
+        ("height", "smallest_px", 1e300),
+        ("cap-fit", "up", "[1.0e+300, 0, -1.0e+300]"),
+        ("registration", "up", "[0, 0, -1.0e-300]"),
+    ],
+)
+def test_a_setting_out_of_all_proportion_is_refused_by_its_name(
+    use: str, setting: str, value: object
+):
+    stages = f"stages:\n  it: {{use: {use}, {setting}: {value}}}\n"
+    text = f"mushpipe: 1\nsource: {{use: synthetic}}\n{stages}"
+    with pytest.raises(GraphError, match=rf"{setting}(\.\d)? of '{use}': "):
+        compile_document(parse_document(text, "graph.yaml", Path()), load_registry())
+
+
+@pytest.mark.parametrize("source", ["mcap, path: bed.mcap", "images, path: bed, depth: d/*.png"])
+@pytest.mark.parametrize("scale", [1000, 1e-300])
+def test_a_depth_scale_that_is_no_part_of_a_metre_is_refused(source: str, scale: float):
+    text = f"mushpipe: 1\nsource: {{use: {source}, depth_scale: {scale}}}\nstages: {{}}\n"
+    with pytest.raises(GraphError, match=f"depth_scale of '{source.partition(',')[0]}': "):
+        compile_document(parse_document(text, "graph.yaml", Path()), load_registry())
