@@ -15,8 +15,8 @@ NO_CAMERA = "%s has no calibration%s: nothing can be measured in metres"
 class Intrinsics(Group):
     """A pinhole camera without distortion, for recordings that carry no calibration."""
 
-    fx: float = Field(gt=0, description="focal length along x, px")
-    fy: float = Field(gt=0, description="focal length along y, px")
+    fx: float = Field(ge=1e-3, le=1e6, description="focal length along x, px")
+    fy: float = Field(ge=1e-3, le=1e6, description="focal length along y, px")
     cx: float = Field(description="principal point, x, px")
     cy: float = Field(description="principal point, y, px")
 

@@ -674,9 +674,17 @@ def test_a_setting_out_of_all_proportion_is_refused_by_its_name(
         compile_document(parse_document(text, "graph.yaml", Path()), load_registry())
 
 
-@pytest.mark.parametrize("source", ["mcap, path: bed.mcap", "images, path: bed, depth: d/*.png"])
-@pytest.mark.parametrize("scale", [1000, 1e-300])
-def test_a_depth_scale_that_is_no_part_of_a_metre_is_refused(source: str, scale: float):
-    text = f"mushpipe: 1\nsource: {{use: {source}, depth_scale: {scale}}}\nstages: {{}}\n"
-    with pytest.raises(GraphError, match=f"depth_scale of '{source.partition(',')[0]}': "):
+@pytest.mark.parametrize(
+    ("source", "setting"),
+    [
+        ("mcap, path: bed.mcap, depth_scale: 1000", "depth_scale"),
+        ("mcap, path: bed.mcap, depth_scale: 1.0e-300", "depth_scale"),
+        ("images, path: bed, depth: d/*.png, depth_scale: 1000", "depth_scale"),
+        ("mcap, path: bed.mcap, camera: {fx: 1.0e+40, fy: 600, cx: 320, cy: 240}", "camera.fx"),
+        ("mcap, path: bed.mcap, camera: {fx: 600, fy: 1.0e-40, cx: 320, cy: 240}", "camera.fy"),
+    ],
+)
+def test_a_unit_or_lens_that_no_camera_has_is_refused_by_its_name(source: str, setting: str):
+    text = f"mushpipe: 1\nsource: {{use: {source}}}\nstages: {{}}\n"
+    with pytest.raises(GraphError, match=f"{setting} of '{source.partition(',')[0]}': "):
         compile_document(parse_document(text, "graph.yaml", Path()), load_registry())
