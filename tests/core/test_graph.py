@@ -653,6 +653,8 @@ def test_numbers_may_begin_with_their_point() -> None:
         ("hough-skimage", "sigma", 1e5),
         ("hough", "min_distance_px", 1e5),  # these two took all memory
         ("cap-net", "radius_px", "[16, 1.0e+15]"),
+        ("fuse-depth", "depth_noise_mm", 300),  # in um; surfaces a metre apart were mixed
+        ("fuse-depth", "depth_noise_per_m", 1200),
         ("hough", "radius_px", "[8, 1.0e+30]"),  # the others overflowed in the run
         ("hough", "apart", 1e308),
         ("chan-vese", "mu", 1e30),
