@@ -38,7 +38,10 @@ class ImagesSource(ReplaySource):
     )
     depth: str | None = Field(None, description="names of the depth images: depth/*.png, say")
     depth_scale: float | None = Field(
-        None, gt=0, description="metres per unit of depth: 0.001 where a unit is a millimetre"
+        None,
+        ge=1e-9,
+        le=1,
+        description="metres per unit of depth: 0.001 where a unit is a millimetre",
     )
     camera: Intrinsics | None = Field(None, description="intrinsics of the colour images")
     fps: float = Field(30, ge=1e-6, le=1000, description="frames per second")

@@ -17,8 +17,8 @@ NO_CAMERA = "%s has no calibration%s: nothing can be measured in metres"
 class Intrinsics(Group):
     """A pinhole camera without distortion, for recordings that carry no calibration."""
 
-    fx: float = Field(gt=0, description="focal length along x, px")
-    fy: float = Field(gt=0, description="focal length along y, px")
+    fx: float = Field(ge=1e-3, le=1e6, description="focal length along x, px")
+    fy: float = Field(ge=1e-3, le=1e6, description="focal length along y, px")
     cx: float = Field(description="principal point, x, px")
     cy: float = Field(description="principal point, y, px")
 
@@ -55,7 +55,10 @@ class RecordedSource(Source):
     camera_topic: str | None = Field(None, description="calibration of the colour images")
     use_depth: bool = Field(True, description="false plays colour only")
     depth_scale: float | None = Field(
-        None, gt=0, description="metres per unit of depth, where the recording does not say it"
+        None,
+        ge=1e-9,
+        le=1,
+        description="metres per unit of depth, where the recording does not say it",
     )
     pair_tolerance_ms: float = Field(
         15.0,

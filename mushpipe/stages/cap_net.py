@@ -6,7 +6,7 @@ from typing import Self
 
 import cv2
 import numpy as np
-from pydantic import Field, PositiveFloat, PrivateAttr, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
 from mushpipe import Circles, GraphPath, Header, Mask, RgbdFrame, Stage
 from mushpipe.core.arrays import Bools, Bytes, Floats, Singles, locked
@@ -18,6 +18,7 @@ from mushpipe.stages.cap_decode import CHANNELS, MASK, STRIDE, circles_of, first
 from mushpipe.stages.discs import (
     LEAST_OF_RANGE,
     MOST_OF_RANGE,
+    Extent,
     certain_first,
     discs_of,
     many_likely,
@@ -49,7 +50,7 @@ class CapNet(Stage):
     large caps can be in the image.
     """
 
-    radius_px: tuple[PositiveFloat, PositiveFloat | None] = Field(
+    radius_px: tuple[Extent, Extent | None] = Field(
         (8, 45),
         description="smallest and largest radius, px; circles may be a tenth beyond; the image is "
         "scaled to suit. [8, null]: what largest_mm is at the depth that is seen, 60 px or more; "

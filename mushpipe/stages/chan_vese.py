@@ -36,10 +36,15 @@ class ChanVese(Stage):
     mu: float = Field(
         0.1,
         gt=0,
+        le=1000,
         description="weight of the contour's length, on gray in 0..1; `pde` stretches gray to it",
     )
-    iterations: int = Field(100, ge=1, description="most iterations of `pde` and `morphological`")
-    smoothing: int = Field(1, ge=0, description="`morphological`: curvature steps per iteration")
+    iterations: int = Field(
+        100, ge=1, le=10_000, description="most iterations of `pde` and `morphological`"
+    )
+    smoothing: int = Field(
+        1, ge=0, le=100, description="`morphological`: curvature steps per iteration"
+    )
     tolerance: float = Field(1e-3, gt=0, description="`pde`: stop when the level set moves less")
 
     @model_validator(mode="after")

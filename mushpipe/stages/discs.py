@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from pydantic import Field
 
 from mushpipe.core.arrays import Floats
 from mushpipe.core.geometry import Camera
@@ -15,6 +16,8 @@ from mushpipe.core.tables import Circles
 # Radii are no more exact than a tenth: by so much an outline may be beyond a range of radii.
 LEAST_OF_RANGE, MOST_OF_RANGE = 0.9, 1.1
 LIKELY = 0.5  # score from which on a circle is more likely a cap than not
+# A setting: a radius, px, or a diameter, mm. Next to 0, or near infinity, kernels overflow.
+Extent = Annotated[float, Field(ge=0.001, le=10_000)]
 _MANY = 5  # caps that tell what caps look like here
 
 

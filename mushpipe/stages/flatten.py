@@ -34,7 +34,9 @@ class Flatten(Stage):
     """
 
     width: int = Field(80, ge=16, le=320, description="width of the fit's thumbnail, px")
-    iterations: int = Field(6, ge=1, description="most rounds of fitting field and classes")
+    iterations: int = Field(
+        6, ge=1, le=1000, description="most rounds of fitting field and classes"
+    )
 
     def open(self) -> None:
         """Compile the kernel."""

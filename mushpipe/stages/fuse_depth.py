@@ -72,9 +72,14 @@ class FuseDepth(Stage):
         4.0, gt=0, le=100, description="least step of depth at which a pixel starts anew"
     )
     depth_noise_mm: float = Field(
-        0.3, ge=0, description="sigma of depth at the camera, mm; the gate is never below four"
+        0.3,
+        ge=0,
+        le=25,
+        description="sigma of depth at the camera, mm; the gate is never below four",
     )
-    depth_noise_per_m: float = Field(1.2, ge=0, description="its growth with depth, mm per m")
+    depth_noise_per_m: float = Field(
+        1.2, ge=0, le=25, description="its growth with depth, mm per m"
+    )
     moved: float = Field(
         0.05,
         gt=0,

@@ -25,11 +25,16 @@ class Height(Stage):
     filled from what is known on its four sides; without any depth the mask is empty.
     """
 
-    min_mm: float = Field(8, gt=0, description="height at which a pixel is more cap than bed, mm")
-    max_mm: float = Field(150, gt=0, description="what rises higher is no mushroom, mm")
+    min_mm: float = Field(
+        8, ge=0.1, le=1000, description="height at which a pixel is more cap than bed, mm"
+    )
+    max_mm: float = Field(150, gt=0, le=1000, description="what rises higher is no mushroom, mm")
     mu: float = Field(0.05, gt=0, description="weight of the contour's length, on height in 0..1")
     smallest_px: float = Field(
-        10, ge=0, description="diameter of the smallest piece that is kept: clods and pins are less"
+        10,
+        ge=0,
+        le=10_000,
+        description="diameter of the smallest piece that is kept: clods and pins are less",
     )
     relief: bool = Field(True, description="follow the relief of the soil; false for a table")
 

@@ -6,21 +6,23 @@ from typing import Literal, Self
 
 import cv2
 import numpy as np
-from pydantic import Field, PositiveFloat, model_validator
+from pydantic import Field, model_validator
 
 from mushpipe import Circles, Mask, RgbdFrame, Stage
 from mushpipe.core.arrays import Bools, Floats, Rows, Singles
+from mushpipe.stages.discs import Extent
 
 
 class _Peer(Stage):
     """What the peers share: their input, and which of their circles are kept."""
 
     input: Literal["image", "mask"] = Field("image", description="where the edges are taken from")
-    radius_px: tuple[PositiveFloat, PositiveFloat] = Field(
-        (8, 38), description="smallest and largest radius, px"
-    )
+    radius_px: tuple[Extent, Extent] = Field((8, 38), description="smallest and largest radius, px")
     apart: float = Field(
-        0.7, ge=0, description="smallest distance of two centres, in radii of the larger circle"
+        0.7,
+        ge=0,
+        le=100,
+        description="smallest distance of two centres, in radii of the larger circle",
     )
     min_score: float = Field(0.6, ge=0, le=1, description="smallest score that is kept")
 
@@ -57,7 +59,9 @@ class Hough(_Peer):
     edge: float = Field(150, gt=0, description="upper Canny threshold, in OpenCV's units")
     perfectness: float = Field(0.6, gt=0, lt=1, description="`alt`: how round a circle must be")
     votes: float = Field(14, gt=0, description="`gradient`: fewest votes of a centre")
-    min_distance_px: float = Field(12, gt=0, description="smallest distance of two centres, px")
+    min_distance_px: float = Field(
+        12, gt=0, le=10_000, description="smallest distance of two centres, px"
+    )
 
     def _candidates(self, gray: Singles) -> Floats:
         image = np.rint(gray * 255).astype(np.uint8)
@@ -83,7 +87,7 @@ class HoughSkimage(_Peer):
     takes about a second per frame. Scores and places as in `hough`.
     """
 
-    sigma: float = Field(1.5, gt=0, description="smoothing before Canny's edges, px")
+    sigma: float = Field(1.5, gt=0, le=100, description="smoothing before Canny's edges, px")
     votes: float = Field(0.35, gt=0, le=1, description="least share of the outline with edges")
 
     def _candidates(self, gray: Singles) -> Floats:

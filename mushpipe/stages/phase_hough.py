@@ -7,12 +7,12 @@ from typing import Annotated, ClassVar, Literal, Self
 
 import cv2
 import numpy as np
-from pydantic import Field, PositiveFloat, PrivateAttr, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
 from mushpipe import Circles, Mask, RgbdFrame, Stage, UsageError
 from mushpipe.core.arrays import Bools, Bytes, Floats, Ints32, Singles
 from mushpipe.core.paths import GraphPath
-from mushpipe.stages.discs import LIKELY, Radii, discs_of, many_likely
+from mushpipe.stages.discs import LIKELY, Extent, Radii, discs_of, many_likely
 from mushpipe.stages.doubling import doubled
 from mushpipe.stages.phase.blobs import blobs_of
 from mushpipe.stages.phase.decide import decide
@@ -93,18 +93,18 @@ class PhaseHough(Stage):
     input: Literal["image", "mask"] = Field(
         "image", description="where edges are taken from; `mask` is the paper's variant, no depth"
     )
-    radius_px: tuple[PositiveFloat, PositiveFloat | None] | None = Field(
+    radius_px: tuple[Extent, Extent | None] | None = Field(
         (8.0, 38.0),
         description="smallest and largest radius looked for, px; outlines may be fitted a tenth "
         "beyond; null takes them from diameter_mm and depth. [8, null]: 80 px, or more where a cap "
         "of diameter_mm is larger at the depth that is seen, or one that is learned",
     )
-    diameter_mm: tuple[PositiveFloat, PositiveFloat] = Field(
+    diameter_mm: tuple[Extent, Extent] = Field(
         (6.0, 120.0), description="smallest and largest diameter, mm, where there is depth"
     )
     min_score: float = Field(0.5, ge=0, le=1, description="smallest score that is kept")
     edge: float = Field(
-        0.25, gt=0, le=2, description="least gradient, in units of Otsu's threshold of gradients"
+        0.25, ge=0.01, le=2, description="least gradient, in units of Otsu's threshold of gradients"
     )
     evidence: Annotated[float, Field(ge=0.01, le=1)] | None = Field(
         None,

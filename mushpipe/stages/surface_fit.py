@@ -38,7 +38,7 @@ class SurfaceFit(Stage):
     depth_noise_mm: float = Field(0.3, ge=0, description="sigma of depth at the camera, mm")
     depth_noise_per_m: float = Field(1.2, ge=0, description="its growth with depth, mm per m")
     circle_sigma_px: float = Field(
-        0.5, gt=0, description="sigma of the circles' centres and radii, px"
+        0.5, gt=0, le=1000, description="sigma of the circles' centres and radii, px"
     )
     min_points: int = Field(8, ge=6, le=30, description="fewest points of the grid a fit needs")
 

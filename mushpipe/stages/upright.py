@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import Annotated, Literal
 
@@ -17,8 +18,11 @@ Vector = tuple[float, float, float]
 
 
 def _with_direction(vector: Vector) -> Vector:
-    if not any(vector):
-        raise ValueError("the upright has no direction: a vector needs a component that is not 0")
+    if not 1e-9 <= math.hypot(*vector) <= 1e9:  # of numbers beyond 1e150 the square is infinite
+        raise ValueError(
+            "the upright has no direction: a vector needs a component that is not 0, and a length "
+            "from 1e-9 to 1e9"
+        )
     return vector
 
 

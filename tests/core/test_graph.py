@@ -641,3 +641,52 @@ def test_numbers_may_begin_with_their_point() -> None:
     text = "a: [-.1, +.5, .2, -.5e-1, .5E2, -.inf]\nb: [.e, -., .1e, -.1.2]\n"
     data = parse_document(text, "g.yaml", Path()).data
     assert data == {"a": [-0.1, 0.5, 0.2, -0.05, 50, -math.inf], "b": [".e", "-.", ".1e", "-.1.2"]}
+
+
+@pytest.mark.parametrize(
+    ("use", "setting", "value"),
+    [
+        ("phase-hough", "edge", 1e-300),  # these two wrote beyond an array: the program crashed
+        ("phase-hough", "radius_px", "[1.0e-323, 38]"),
+        ("chan-vese", "iterations", 10**20),  # these three ran for ever
+        ("chan-vese", "smoothing", 10**20),
+        ("hough-skimage", "sigma", 1e5),
+        ("hough", "min_distance_px", 1e5),  # these two took all memory
+        ("cap-net", "radius_px", "[16, 1.0e+15]"),
+        ("fuse-depth", "depth_noise_mm", 300),  # in um; surfaces a metre apart were mixed
+        ("fuse-depth", "depth_noise_per_m", 1200),
+        ("hough", "radius_px", "[8, 1.0e+30]"),  # the others overflowed in the run
+        ("hough", "apart", 1e308),
+        ("chan-vese", "mu", 1e30),
+        ("flatten", "iterations", 10**20),
+        ("surface-fit", "circle_sigma_px", 1e300),
+        ("height", "min_mm", 1e-300),
+        ("height", "max_mm", 1e300),
+        ("height", "smallest_px", 1e300),
+        ("cap-fit", "up", "[1.0e+300, 0, -1.0e+300]"),
+        ("registration", "up", "[0, 0, -1.0e-300]"),
+    ],
+)
+def test_a_setting_out_of_all_proportion_is_refused_by_its_name(
+    use: str, setting: str, value: object
+):
+    stages = f"stages:\n  it: {{use: {use}, {setting}: {value}}}\n"
+    text = f"mushpipe: 1\nsource: {{use: synthetic}}\n{stages}"
+    with pytest.raises(GraphError, match=rf"{setting}(\.\d)? of '{use}': "):
+        compile_document(parse_document(text, "graph.yaml", Path()), load_registry())
+
+
+@pytest.mark.parametrize(
+    ("source", "setting"),
+    [
+        ("mcap, path: bed.mcap, depth_scale: 1000", "depth_scale"),
+        ("mcap, path: bed.mcap, depth_scale: 1.0e-300", "depth_scale"),
+        ("images, path: bed, depth: d/*.png, depth_scale: 1000", "depth_scale"),
+        ("mcap, path: bed.mcap, camera: {fx: 1.0e+40, fy: 600, cx: 320, cy: 240}", "camera.fx"),
+        ("mcap, path: bed.mcap, camera: {fx: 600, fy: 1.0e-40, cx: 320, cy: 240}", "camera.fy"),
+    ],
+)
+def test_a_unit_or_lens_that_no_camera_has_is_refused_by_its_name(source: str, setting: str):
+    text = f"mushpipe: 1\nsource: {{use: {source}}}\nstages: {{}}\n"
+    with pytest.raises(GraphError, match=f"{setting} of '{source.partition(',')[0]}': "):
+        compile_document(parse_document(text, "graph.yaml", Path()), load_registry())
