@@ -10,7 +10,7 @@ from io import FileIO
 from pathlib import Path
 
 from mushpipe.core.errors import MushpipeError, UsageError
-from mushpipe.core.paths import real
+from mushpipe.core.paths import STDIO, real
 
 
 def same_file(a: Path, b: Path) -> bool:
@@ -134,6 +134,8 @@ def clashes(
 
 def _fault(path: Path, with_folder: bool) -> str:
     """Return why no file can be written at a path, "" where one can."""
+    if path == STDIO:
+        return "it would be standard output; name a file"
     if path.is_dir():
         return "it is a folder"
     if not path.parent.is_dir():

@@ -54,7 +54,9 @@ GravityOption = Annotated[
     str, typer.Option(metavar="X,Y,Z", help="direction of gravity in the camera's frame")
 ]
 TopicOption = Annotated[str | None, typer.Option(help="what to judge, where there is a choice")]
-ResamplesOption = Annotated[int, typer.Option(min=0, help="bootstrap samples; 0 is none")]
+ResamplesOption = Annotated[
+    int, typer.Option(min=0, max=100_000, help="bootstrap samples; 0 is none")
+]
 SeedOption = Annotated[int, typer.Option(min=0, help="seed of the bootstrap")]
 OutOption = Annotated[Path | None, typer.Option(help="folder to keep the graph's results in")]
 ReportOption = Annotated[Path | None, typer.Option(help="folder for a page with plots")]

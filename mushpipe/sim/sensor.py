@@ -69,8 +69,8 @@ class DepthSensor(Group):
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
-        if not 0 <= self.range_m[0] < self.range_m[1]:
-            raise ValueError("range_m must be [nearest, farthest]")
+        if not 0 <= self.range_m[0] < self.range_m[1] <= 100:
+            raise ValueError("range_m must be [nearest, farthest], in m, at most 100")
         return self
 
     def scan(self, world: World, view: View, surface: Surface, paint: Paint, seed: int) -> Exact:

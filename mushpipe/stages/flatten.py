@@ -25,6 +25,7 @@ _DARK = 2.0  # keeps the logarithm of black finite, on 0..255
 # Noise in the logarithm goes with the inverse of brightness: what is darker than this counts
 # little. The gaps of a real bed are black in any light.
 _DIM = 20.0
+_HIGHEST = 10  # times the thumbnail's width: a narrow strip would take all memory
 
 
 class Flatten(Stage):
@@ -45,7 +46,7 @@ class Flatten(Stage):
     def process(self, frame: RgbdFrame) -> RgbdFrame:
         """Return the frame under even light; depth and calibration are untouched."""
         height, width = frame.gray.shape
-        size = (self.width, max(8, round(self.width * height / width)))
+        size = (self.width, max(8, round(self.width * min(height / width, _HIGHEST))))
         thumbnail = cv2.resize(frame.gray, size, interpolation=cv2.INTER_AREA)
         field = light_field(np.asarray(thumbnail, np.float32) * 255, self.iterations)
         gain = cv2.resize(np.exp(-field).astype(np.float32), (width, height))

@@ -369,6 +369,15 @@ def test_the_module_is_the_command() -> None:
     assert "phase-hough" in done.stdout
 
 
+@pytest.mark.parametrize(
+    "arguments", [["eval", "a.mcap"], ["calibrate", "depth", "a.mcap", "--plane", "0.5"]]
+)
+def test_no_bootstrap_takes_all_memory(arguments: list[str]) -> None:
+    done = CliRunner().invoke(app, [*arguments, "--resamples", "1000000000"])
+    assert done.exit_code == EXIT_USAGE
+    assert "--resamples" in done.output
+
+
 @pytest.mark.parametrize("number", ["nan", "inf"])
 @pytest.mark.parametrize(
     "arguments",

@@ -326,6 +326,25 @@ def test_where_nothing_can_be_written_no_work_begins(
     assert done.stderr == "error: none/a.json cannot be written: there is no folder none\n"
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("bench", "graph.yaml", "--json", "-"),
+        ("calibrate", "depth", "a.mcap", "--plane", "0.5", "-o", "-"),
+        ("run", "graph.yaml", "--manifest", "-"),
+        ("schema", "-o", "-"),
+    ],
+)
+def test_what_is_no_stream_gets_into_no_file_of_the_name_of_one(
+    folder: Path, arguments: tuple[str, ...]
+) -> None:
+    done = mushpipe(*arguments, cwd=folder)
+    assert done.returncode == EXIT_USAGE
+    expected = "- cannot be written: it would be standard output; name a file"
+    assert done.stderr.splitlines()[-1] == f"error: {expected}"
+    assert not (folder / "-").exists()
+
+
 def test_a_file_that_cannot_be_written_is_named(folder: Path) -> None:
     done = mushpipe("schema", "-o", "/proc/nowhere/schema.json", cwd=folder)
     assert done.returncode == EXIT_USAGE

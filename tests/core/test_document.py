@@ -26,6 +26,15 @@ def refused(text: str) -> str:
     return str(caught.value)
 
 
+def test_of_what_is_too_large_for_a_graph_no_more_is_read(tmp_path: Path):
+    """A recording that is given as a graph is larger than the memory of many a computer."""
+    recording = tmp_path / "bed.bag"
+    with recording.open("wb") as file:
+        file.truncate(10**12)
+    with pytest.raises(GraphError, match=r"bed\.bag: it has more than 2 MB: .*--source"):
+        read_document(recording)
+
+
 def test_places_of_keys_and_values_count_from_one():
     document = parse("a: 1\nb:\n  c: [x, {d: 2.5}]\n")
     assert document.data == {"a": 1, "b": {"c": ["x", {"d": 2.5}]}}

@@ -163,6 +163,8 @@ def test_what_no_unit_can_say_is_lost_and_a_range_has_two_ends():
     assert (DepthSensor(**CLEAN, unit_mm=0.01).sense(far, 0, 0) == 0).all()
     with pytest.raises(ValueError, match="nearest, farthest"):
         DepthSensor(range_m=(1.5, 0.2))
+    with pytest.raises(ValueError, match="in m, at most 100"):
+        DepthSensor(range_m=(200, 1500))  # in mm: every pixel would be lost
 
 
 def holes(settings, world, gloss=1.0, **parts):

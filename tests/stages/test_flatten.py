@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from mushpipe import RgbdFrame
+from mushpipe.stages import flatten
 from mushpipe.stages.chan_vese import ChanVese
 from mushpipe.stages.flatten import Flatten, apply_gain, light_field
 from tests.stages.frames import iou, recorded, simulated, truth_of
@@ -46,6 +47,17 @@ def test_a_gradient_on_simulated_beds(seed: int) -> None:
     ]
     even, graded = (iou(found(frame), truth_of(frame)) for frame in beds)
     assert graded >= even - 0.02
+
+
+def test_the_thumbnail_of_a_strip_is_not_larger_than_that_of_an_image(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen = []
+    monkeypatch.setattr(flatten, "light_field", lambda gray, _: seen.append(gray.shape) or gray * 0)
+    for height, width in ((3000, 1), (640, 64), (1, 3000), (480, 640)):
+        strip = RgbdFrame(HEADER, np.full((height, width, 3), 9, np.uint8))
+        assert (Flatten(width=160).process(strip).color == strip.color).all()
+    assert seen == [(1600, 160), (1600, 160), (8, 160), (120, 160)]
 
 
 def test_depth_and_calibration_are_handed_on() -> None:
