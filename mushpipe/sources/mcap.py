@@ -35,7 +35,10 @@ class McapSource(RecordedSource, ReplaySource):
 
     path: GraphPath = Field(description="the recording")
     start: float = Field(
-        0.0, ge=0, description="skip so many seconds of the recording, from its first colour image"
+        0.0,
+        ge=0,
+        le=1e9,
+        description="skip so many seconds of the recording, from its first colour image",
     )
     end: float | None = Field(None, gt=0, le=1e9, description="stop at this second, counted alike")
     loop: int = Field(1, ge=0, description="how many times to play it; 0 is for ever")

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from mushpipe import Circles, GraphPath, Mask, RgbdFrame, Stage
 from mushpipe.core.arrays import Bools, Bytes, Floats, Singles
@@ -20,7 +20,7 @@ from mushpipe.stages.onnx_layouts import PER_PIXEL, SHAPES, boxes_of, in_pixels,
 
 Triple = tuple[float, float, float]
 Size = Annotated[int, Field(ge=1)]
-Spread = Annotated[float, Field(gt=0)]
+Spread = Annotated[float, Field(ge=1e-6)]
 _MOST = 1000  # boxes that are looked at, the surest
 
 
@@ -59,6 +59,13 @@ class Onnx(Stage):
     overlap: float = Field(0.4, ge=0, le=1, description="largest IoU of two circles, for boxes")
 
     _net: OnnxFile | None = PrivateAttr(None)
+
+    @field_validator("mean", "std")
+    @classmethod
+    def _of_shares(cls, value: Triple) -> Triple:
+        if max(map(abs, value)) > 10:
+            raise ValueError("channels are on 0..1: was it given for 0..255? Divide it by 255")
+        return value
 
     @model_validator(mode="after")
     def _labelled(self) -> Self:

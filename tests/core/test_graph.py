@@ -660,6 +660,9 @@ def test_numbers_may_begin_with_their_point() -> None:
         ("chan-vese", "mu", 1e30),
         ("flatten", "iterations", 10**20),
         ("surface-fit", "circle_sigma_px", 1e300),
+        ("onnx", "mean", "[123.675, 116.28, 103.53]"),  # these two made any image a plain one
+        ("onnx", "std", "[58.395, 57.12, 57.375]"),
+        ("onnx", "std", "[1, 1, 1.0e-300]"),
         ("height", "min_mm", 1e-300),
         ("height", "max_mm", 1e300),
         ("height", "smallest_px", 1e300),
@@ -681,6 +684,7 @@ def test_a_setting_out_of_all_proportion_is_refused_by_its_name(
     [
         ("mcap, path: bed.mcap, depth_scale: 1000", "depth_scale"),
         ("mcap, path: bed.mcap, depth_scale: 1.0e-300", "depth_scale"),
+        ("mcap, path: bed.mcap, start: 1.0e+300", "start"),  # overflowed in `mushpipe view`
         ("images, path: bed, depth: d/*.png, depth_scale: 1000", "depth_scale"),
         ("mcap, path: bed.mcap, camera: {fx: 1.0e+40, fy: 600, cx: 320, cy: 240}", "camera.fx"),
         ("mcap, path: bed.mcap, camera: {fx: 600, fy: 1.0e-40, cx: 320, cy: 240}", "camera.fy"),
