@@ -244,6 +244,8 @@ def replay(
 
     if (connect is None) == (listen is None):
         raise typer.BadParameter("give either --connect or --listen")
+    if listen is not None and (accept_replay or token_file):
+        raise typer.BadParameter("--accept-replay and --token-file go with --connect")
     lines, damage = lines_of(file, client)
     try:
         if connect is not None:

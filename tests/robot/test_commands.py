@@ -253,6 +253,8 @@ def test_an_address_may_be_of_ipv6(monkeypatch: pytest.MonkeyPatch, written: str
         ("client", "--mode", "stream", "--max", 1),
         ("client", "--tls-ca", "nofile.pem"),
         ("replay", "robot.mcap", "--listen", 99999),
+        ("replay", "robot.mcap", "--listen", 0, "--accept-replay"),
+        ("replay", "robot.mcap", "--listen", 0, "--token-file", "robot.token"),
     ],
 )
 def test_arguments_that_make_no_sense_are_refused(arguments: tuple[object, ...]) -> None:
