@@ -39,7 +39,7 @@ def probability(found: NDArray[Any], kind: str, class_id: int) -> Singles:
         ValueError, IndexError: Another shape, no such channel, or values of another kind.
     """
     planes = found[0] if found.ndim == 4 else found
-    if planes.ndim != 3 or found.shape[0] != 1:
+    if planes.ndim != 3 or found.shape[0] != 1 or not planes.size:
         raise ValueError("the shape is another")
     planes = planes.astype(np.float64)
     if kind == "labels":

@@ -43,6 +43,13 @@ def test_labels_are_whole_and_probabilities_within_one() -> None:
         probability(LOGITS, "probabilities", 1)
 
 
+@pytest.mark.parametrize("kind", ["logits", "probabilities", "labels"])
+def test_a_map_without_a_pixel_is_none(kind: str) -> None:
+    """Such are the boxes of a bed in which a detector sees nothing."""
+    with pytest.raises(ValueError, match="the shape is another"):
+        probability(np.zeros((1, 1, 0)), kind, 0)
+
+
 @pytest.mark.parametrize(("found", "kind", "text"), [
     (KEPT, "yolov8", "rows and columns are exchanged"),
     (BOX[..., :5] / 320, "yolov8", "rows and columns are exchanged"),
