@@ -41,6 +41,8 @@ def faults_of(
                 message = _expected(path)
             if item["type"] in ("list_type", "tuple_type"):  # of which pydantic says "array"
                 message = "expected a list in brackets, such as [a, b]"
+            if item["type"].startswith("byte_size"):
+                message = "expected a size with its unit, such as 500MB or 2GB"
             if item["type"] == "json_invalid":  # half a character: "\ud800", or of a name
                 what = what if use else "the graph"
                 message = "a text in it is not UTF-8: give the file another name"

@@ -679,6 +679,15 @@ def test_a_setting_out_of_all_proportion_is_refused_by_its_name(
         compile_document(parse_document(text, "graph.yaml", Path()), load_registry())
 
 
+@pytest.mark.parametrize("size", ["abc", -5, "2 furlongs"])
+def test_a_size_of_files_is_explained(size: object):
+    sinks = f"sinks:\n  log: {{use: mcap, path: a.mcap, split_size: {size}}}\n"
+    text = f"mushpipe: 1\nsource: {{use: synthetic}}\nstages: {{}}\n{sinks}"
+    expected = "split_size of 'mcap': expected a size with its unit, such as 500MB or 2GB, got"
+    with pytest.raises(GraphError, match=expected):
+        compile_document(parse_document(text, "graph.yaml", Path()), load_registry())
+
+
 @pytest.mark.parametrize(
     ("source", "setting"),
     [
