@@ -79,12 +79,18 @@ def read_document(path: Path, example: str = "mushpipe: 1") -> Document:
 
     Raises:
         GraphError: It is missing, not UTF-8, not YAML, not a mapping, has a key twice, a tag
-            other than the plain ones, or is too large, be it after its aliases are expanded.
+            other than the plain ones, or is too large, before or after aliases are expanded.
     """
     try:
         with path.open("rb") as file:
             content = file.read(MAX_BYTES + 1)
-        text = "" if len(content) > MAX_BYTES else content.decode()
+        if len(content) > MAX_BYTES:
+            message = (
+                f"it has more than {MAX_BYTES / 1e6:g} MB: expected a mapping such as '{example}'; "
+                "a recording is no graph: a graph plays it, with --source"
+            )
+            raise GraphError([Problem(str(path), 0, 0, message)])
+        text = content.decode()
     except FileNotFoundError:
         raise GraphError([Problem(str(path), 0, 0, "there is no such file")]) from None
     except UnicodeDecodeError as error:
@@ -93,12 +99,6 @@ def read_document(path: Path, example: str = "mushpipe: 1") -> Document:
         raise GraphError([Problem(str(path), len(before), len(before[-1]) + 1, message)]) from error
     except OSError as error:
         raise GraphError([Problem(str(path), 0, 0, f"cannot be read: {error.strerror}")]) from error
-    if len(content) > MAX_BYTES:
-        message = (
-            f"it has more than {MAX_BYTES / 1e6:g} MB: expected a mapping such as '{example}'; a "
-            "recording is no graph: a graph plays it, with --source"
-        )
-        raise GraphError([Problem(str(path), 0, 0, message)])
     return parse_document(text, str(path), path.parent, example)
 
 

@@ -18,7 +18,7 @@ from pydantic import Field, PrivateAttr, field_validator, model_validator
 from mushpipe import Header, InputError, ReplaySource, RgbdFrame, UsageError
 from mushpipe.core.paths import IMAGES, RECORDINGS, GraphPath, require_listed
 from mushpipe.core.types import COLOR_FRAME
-from mushpipe.sources.recorded import NO_CAMERA, NO_DEPTH, Intrinsics
+from mushpipe.sources.recorded import NO_CAMERA, NO_DEPTH, DepthScale, Intrinsics
 
 logger = logging.getLogger("mushpipe")
 ALONE = "%s images without a %s image"
@@ -37,11 +37,8 @@ class ImagesSource(ReplaySource):
         "*", description="names of the colour images below the folder: rgb/*.png, or *_color.jpg"
     )
     depth: str | None = Field(None, description="names of the depth images: depth/*.png, say")
-    depth_scale: float | None = Field(
-        None,
-        ge=1e-9,
-        le=1,
-        description="metres per unit of depth: 0.001 where a unit is a millimetre",
+    depth_scale: DepthScale | None = Field(
+        None, description="metres per unit of depth: 0.001 where a unit is a millimetre"
     )
     camera: Intrinsics | None = Field(None, description="intrinsics of the colour images")
     fps: float = Field(30, ge=1e-6, le=1000, description="frames per second")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from typing import Annotated
 
 from pydantic import Field, PrivateAttr
 
@@ -12,6 +13,7 @@ from mushpipe.core.stage import Source
 
 NO_DEPTH = "%s has no depth: positions, distances and diameters will be missing"
 NO_CAMERA = "%s has no calibration%s: nothing can be measured in metres"
+DepthScale = Annotated[float, Field(ge=1e-9, le=1)]  # m per unit: no camera has more, or less
 
 
 class Intrinsics(Group):
@@ -54,11 +56,8 @@ class RecordedSource(Source):
     depth_topic: str | None = Field(None, description="depth images aligned to colour")
     camera_topic: str | None = Field(None, description="calibration of the colour images")
     use_depth: bool = Field(True, description="false plays colour only")
-    depth_scale: float | None = Field(
-        None,
-        ge=1e-9,
-        le=1,
-        description="metres per unit of depth, where the recording does not say it",
+    depth_scale: DepthScale | None = Field(
+        None, description="metres per unit of depth, where the recording does not say it"
     )
     pair_tolerance_ms: float = Field(
         15.0,

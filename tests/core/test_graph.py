@@ -16,6 +16,7 @@ from mushpipe.core.document import Document, parse_document, read_document
 from mushpipe.core.errors import GraphError
 from mushpipe.core.graph import compile_document
 from mushpipe.core.group import Group
+from mushpipe.core.plan import Plan
 from mushpipe.core.plugins import load_registry
 from mushpipe.sinks.mcap import McapSink
 from mushpipe.sinks.rerun import RerunSink
@@ -39,6 +40,11 @@ stages:
 sinks:
   out: {use: collect, size: 0.5, delivery: latest}
 """
+
+
+def compiled(text: str) -> Plan:
+    """Compile a graph of the plugins that mushpipe brings."""
+    return compile_document(parse_document(text, "graph.yaml", Path()), load_registry())
 
 
 def test_a_good_graph_becomes_a_plan(lab: Lab):
@@ -297,7 +303,7 @@ def test_a_misspelt_setting_within_a_group_is_told_its_neighbours():
     text = "mushpipe: 1\nsource: {use: synthetic}\nsinks:\n  robot: {use: robot-json, workspace: "
     text += "{low: [0, 0, 0], high: [1, 1, 1], lo: 1}}\n"
     with pytest.raises(GraphError, match=r"4:73: unknown setting 'lo' of 'robot-json'") as raised:
-        compile_document(parse_document(text, "graph.yaml", Path()), load_registry())
+        compiled(text)
     assert "did you mean 'low'?" in str(raised.value)
 
 
@@ -408,7 +414,7 @@ def test_a_value_that_a_list_lacks_is_counted(lab: Lab):
 def test_a_setting_of_several_types_is_called_by_its_own_name(given: str, faults: list[str]):
     graph = "mushpipe: 1\nsource: {use: synthetic}\nstages:\n  pose: {use: cap-fit, up: %s}\n"
     with pytest.raises(GraphError) as caught:
-        compile_document(parse_document(graph % given, "graph.yaml", Path()), load_registry())
+        compiled(graph % given)
     lines = [line for line in str(caught.value).splitlines() if "up of 'cap-fit': " in line]
     assert all(any(fault in line for line in lines) for fault in faults)
     assert "function-after" not in str(caught.value)
@@ -676,7 +682,7 @@ def test_a_setting_out_of_all_proportion_is_refused_by_its_name(
     stages = f"stages:\n  it: {{use: {use}, {setting}: {value}}}\n"
     text = f"mushpipe: 1\nsource: {{use: synthetic}}\n{stages}"
     with pytest.raises(GraphError, match=rf"{setting}(\.\d)? of '{use}': "):
-        compile_document(parse_document(text, "graph.yaml", Path()), load_registry())
+        compiled(text)
 
 
 @pytest.mark.parametrize("size", ["abc", -5, "2 furlongs"])
@@ -685,7 +691,7 @@ def test_a_size_of_files_is_explained(size: object):
     text = f"mushpipe: 1\nsource: {{use: synthetic}}\nstages: {{}}\n{sinks}"
     expected = "split_size of 'mcap': expected a size with its unit, such as 500MB or 2GB, got"
     with pytest.raises(GraphError, match=expected):
-        compile_document(parse_document(text, "graph.yaml", Path()), load_registry())
+        compiled(text)
 
 
 @pytest.mark.parametrize(
@@ -702,4 +708,4 @@ def test_a_size_of_files_is_explained(size: object):
 def test_a_unit_or_lens_that_no_camera_has_is_refused_by_its_name(source: str, setting: str):
     text = f"mushpipe: 1\nsource: {{use: {source}}}\nstages: {{}}\n"
     with pytest.raises(GraphError, match=f"{setting} of '{source.partition(',')[0]}': "):
-        compile_document(parse_document(text, "graph.yaml", Path()), load_registry())
+        compiled(text)
