@@ -412,7 +412,7 @@ def test_no_option_that_decides_something_takes_what_is_no_number(
         (["record", "--source", "synthetic", "-o", "\udcff.mcap"], "a text in it is not UTF-8"),
         (["view", "\udcff.mcap", "--save", "a.rrd"], "there is no such recording"),
         (["plugins", "describe", "\udcff.py:A"], "cannot be the name of a file"),
-        (["validate", "nul.yaml"], "cannot be the name of a file: embedded null byte"),
+        (["validate", "nul.yaml"], "cannot be the name of a file: "),
         (["validate", "half.yaml"], "half.yaml:1:1: the graph: a text in it is not UTF-8"),
     ],
 )

@@ -50,7 +50,7 @@ def test_a_camera_is_missed_only_where_it_is_asked_for(computer, options, code, 
     assert ended == code
     assert found["camera"]["state"] == state
     assert found["camera"]["text"].startswith("no RealSense camera is connected")
-    assert "an SR300 or SR305 needs pyrealsense2 2.54" in found["camera"]["cure"]
+    assert "pyrealsense2 2.54" in found["camera"]["cure"]
 
 
 def test_a_camera_is_shown_with_what_it_says_of_itself(computer):
@@ -156,6 +156,6 @@ def test_a_kernel_cache_that_cannot_be_written_is_told(computer, monkeypatch):
 def test_plain_lines_in_a_pipe(computer, monkeypatch, capsys):
     assert cli(monkeypatch, "doctor") == EXIT_OK
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("OK      Python: 3.")
+    assert lines[0].split()[1] == "Python:"
     at = lines.index("NOTE    camera: no RealSense camera is connected; plug it into a USB 3 port")
     assert lines[at + 1].startswith("        -> this is librealsense ")
