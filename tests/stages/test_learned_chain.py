@@ -168,7 +168,7 @@ def test_what_is_hardly_a_cap_changes_nothing_about_those_that_are_likely(learne
     Whether a frame has such a circle differs by the last bits of the network, hence by processor.
     """
     settings = {"soil": 3.0, "rubble": 50, "stumps": 5, "count": 60, "cluster": 1.0}
-    below = contested = 0
+    below = contested = alone = 0
     for seed in (81, 82):
         frame = simulated(seed, width=640, height=480, shape_family="b", **settings)
         mask, circles = CapNet(radius_px=RADII, min_score=0.05).process(frame)
@@ -182,11 +182,15 @@ def test_what_is_hardly_a_cap_changes_nothing_about_those_that_are_likely(learne
             contested += len(likely)
             likely, same = apart(likely, hardly), apart(same, hardly)
             contested -= len(likely)
-        for column in ("center", "radius", "score"):
-            assert np.array_equal(getattr(same, column), getattr(likely, column))
+        assert np.array_equal(same.score, likely.score)
+        # What may stand for the same cap may have had edges of its neighbour.
+        beside = 0.01 * learned  # px
+        np.testing.assert_allclose(same.center, likely.center, rtol=0, atol=beside)
+        np.testing.assert_allclose(same.radius, likely.radius, rtol=0, atol=beside)
+        alone += len(likely)
         below += len(hardly)
     assert below > contested
-    assert contested <= 2
+    assert contested < alone / 20
 
 
 def test_a_part_of_a_cap_that_becomes_the_cap_is_no_second_one() -> None:
