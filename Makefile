@@ -161,4 +161,4 @@ goldens: $(STAMP)-dev system-libraries
 	$(BIN)/python -m tests.proof.goldens
 
 clean:
-	rm -rf $(VENV) out failures .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) $(LOWEST) out failures .mypy_cache .ruff_cache .pytest_cache
