@@ -77,15 +77,16 @@ unit: $(STAMP)-dev
 test-slow: $(STAMP)-dev system-libraries
 	$(BIN)/pytest -m slow
 
-# With the oldest versions that pyproject.toml allows. Goldens are left out: an older numba compiles
-# kernels to other last bits.
+# With the oldest versions that pyproject.toml allows. Goldens are left out, and a test that depends
+# on the last bits as well: older versions of numba and ONNX Runtime have others.
 LOWEST := .venv-lowest
 .PHONY: test-lowest
 test-lowest: system-libraries
 	$(PYTHON) -m venv --clear $(LOWEST)
 	$(LOWEST)/bin/pip install --quiet --disable-pip-version-check uv
 	$(LOWEST)/bin/uv pip install --quiet --python $(LOWEST) --resolution lowest-direct --editable '.[dev]'
-	$(LOWEST)/bin/pytest -m 'not slow' --numprocesses 2 --dist worksteal --ignore tests/proof/test_goldens.py
+	$(LOWEST)/bin/pytest -m 'not slow' --numprocesses 2 --dist worksteal --ignore tests/proof/test_goldens.py \
+	  --deselect tests/stages/test_learned_chain.py::test_what_is_hardly_a_cap
 
 # Weights of the verifiers of detector and cap fit, from simulated scenes alone; rendering takes minutes.
 .PHONY: verifier
