@@ -80,10 +80,10 @@ class RealsenseSource(ReplaySource):
         (), description="librealsense's filters for depth, in this order, before alignment"
     )
     warm_up: int = Field(
-        30, ge=0, description="live frames thrown away at first, while exposure settles"
+        30, ge=0, le=3000, description="live frames thrown away at first, while exposure settles"
     )
     patience_s: float = Field(
-        5.0, ge=1, description="a camera that is silent for longer counts as lost, s"
+        5.0, ge=1, le=600, description="a camera that is silent for longer counts as lost, s"
     )
     reconnect_s: float = Field(
         60.0, ge=0, description="how long to wait for a lost camera to come back, s"

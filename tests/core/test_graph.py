@@ -703,9 +703,11 @@ def test_a_size_of_files_is_explained(size: object):
         ("images, path: bed, depth: d/*.png, depth_scale: 1000", "depth_scale"),
         ("mcap, path: bed.mcap, camera: {fx: 1.0e+40, fy: 600, cx: 320, cy: 240}", "camera.fx"),
         ("mcap, path: bed.mcap, camera: {fx: 600, fy: 1.0e-40, cx: 320, cy: 240}", "camera.fy"),
+        ("realsense, warm_up: 30000", "warm_up"),  # no frame for 17 minutes
+        ("realsense, patience_s: 5000", "patience_s"),  # in ms: a lost camera told 83 minutes late
     ],
 )
-def test_a_unit_or_lens_that_no_camera_has_is_refused_by_its_name(source: str, setting: str):
+def test_what_no_source_has_is_refused_by_its_name(source: str, setting: str):
     text = f"mushpipe: 1\nsource: {{use: {source}}}\nstages: {{}}\n"
     with pytest.raises(GraphError, match=f"{setting} of '{source.partition(',')[0]}': "):
         compiled(text)
