@@ -116,9 +116,10 @@ def _refuse_to_overwrite(plan: Plan) -> None:
 def _show_files(plan: Plan, report: RunReport) -> None:
     from mushpipe.console import stderr
 
-    for path in _files(plan):
+    stored = _files(plan)
+    for path in stored:
         stderr.print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
     if report.dropped:
-        cure = "--colour jpeg or a faster disk would help"
+        cure = f"--colour jpeg or a faster {'disk' if stored else 'reader or network'} would help"
         slow = f"{report.dropped} frames were lost because writing was too slow; {cure}"
         stderr.print(slow, style="yellow")

@@ -107,6 +107,7 @@ class FrameMaker:
         if self._has_depth:
             self._scale = link.profile.get_device().first_depth_sensor().get_depth_scale()
             self._gain, self._shift = _along_color_axis(streams, self._camera, self._scale)
+            self._place = _without_lens(self._camera)
         self._filters = [make() for make in self._makers]  # they remember what was there before
         self._live = link.live
         self._to_skip = self._warm_up if link.live else 0
@@ -157,6 +158,8 @@ class FrameMaker:
             frames = block.process(frames).as_frameset()
         # A copy: librealsense stops delivering when its buffers are held.
         depth = np.array(self._align.process(frames).get_depth_frame().get_data(), np.uint16)
+        if self._place is not None:
+            depth = np.append(depth, np.uint16(0))[self._place]
         if self._gain is None:
             return depth
         end = end_of_scale(depth)
@@ -208,6 +211,23 @@ def _along_color_axis(
     pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
     rays = camera.deproject(pixels.astype(float), np.ones(pixels.shape[:2]))
     return (1 / (rays @ r3)).astype(np.float32), np.float32(r3 @ t / scale)
+
+
+def _without_lens(camera: Camera) -> Ints | None:
+    """Return (H, W) the places in aligned depth, counted row by row, whose rays pixels have.
+
+    librealsense aligns depth as if the colour camera had no lens, whatever its coefficients. A
+    pixel with a ray beyond that image has the place behind the last. None without a lens.
+    """
+    if camera.model == "none":
+        return None
+    pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
+    rays = camera.deproject(pixels.astype(float), np.ones(pixels.shape[:2]))
+    u = np.rint(rays[..., 0] * camera.fx + camera.cx)
+    v = np.rint(rays[..., 1] * camera.fy + camera.cy)
+    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    beyond = camera.width * camera.height
+    return np.where(inside, v * camera.width + u, beyond).astype(np.int64)
 
 
 def _recorded_arrival_ns(frame: Any) -> int:

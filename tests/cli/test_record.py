@@ -209,6 +209,19 @@ def test_what_a_disk_is_too_slow_for_is_told(tmp_path: Path) -> None:
     assert numbers[-1] == 99
 
 
+def test_what_a_reader_is_too_slow_for_is_told(tmp_path: Path) -> None:
+    """Of a stream; no disk has a part in it."""
+    (tmp_path / "cam.py").write_text(CAMERA_PY)
+    command = [*MAIN, "record", "--source", "./cam.py:Fast", "-o", "-"]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, cwd=tmp_path, stdout=pipe, stderr=pipe) as sender:
+        deadline = time.monotonic() + PATIENCE_S
+        while time.monotonic() < deadline and not (tmp_path / "shown").exists():
+            time.sleep(0.01)
+        told = sender.communicate(timeout=PATIENCE_S)[1].decode()
+    assert "writing was too slow; --colour jpeg or a faster reader or network would help" in told
+
+
 def test_a_stream_is_not_split(scene: Path, tmp_path: Path) -> None:
     done = mushpipe("record", "--source", scene, "-o", "-", "--split-size", "1MB", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (EXIT_USAGE, "")

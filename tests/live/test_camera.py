@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -69,6 +70,29 @@ def test_depth_is_aligned_to_colour_as_an_independent_projection_says(shift, tur
     assert np.nanmax(error) < 0.001
     assert np.nanmedian(error) < 0.0003
     assert np.median(np.abs(seen * UNITS - expected)[inner]) > 0.004
+
+
+@pytest.mark.parametrize("model", ["brown_conrady", "inverse_brown_conrady"])
+def test_depth_lies_where_a_colour_lens_shows_it(model):
+    """librealsense aligns as if there were no lens; the coefficients are those of a D455."""
+    coefficients = (-0.0565, 0.0682, 0.0004, 0.0007, -0.0218)
+    lens = Camera(640, 480, 387.0, 386.0, 321.5, 243.0, model, coefficients)
+    sight = Camera(640, 480, 387.0, 387.0, 318.0, 240.0)
+    rig = Rig(color=lens, depth=sight, shift=(-0.059, 0.0, 0.0))
+    source = rig.source()
+    source.open()
+    frames, color = source.frames(), rig.images(0)["color"]
+    for number, (u, v) in enumerate([(120, 60), (560, 50), (380, 240), (130, 420), (590, 430)]):
+        seen = np.zeros((480, 640), np.uint16)
+        seen[v - 5 : v + 6, u - 5 : u + 6] = round(0.4 / UNITS)
+        rig.feed(number, {"depth": seen, "color": color})
+        rows, columns = np.nonzero(next(frames).depth)
+        point = sight.deproject(np.array([u, v]), np.array(0.4)) + np.array([-0.059, 0.0, 0.0])
+        matrix = np.array([[387.0, 0, 321.5], [0, 386.0, 243.0], [0, 0, 1]])
+        still = np.zeros(3)
+        shown = cv2.projectPoints(point[None], still, still, matrix, np.array(coefficients))[0]
+        assert (columns.mean(), rows.mean()) == pytest.approx(shown.ravel(), abs=1)
+    source.close()
 
 
 def test_what_is_beyond_the_scale_of_depth_is_missing_also_where_it_is_moved():
