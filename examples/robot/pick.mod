@@ -9,21 +9,26 @@ MODULE MushroomPicker
     CONST num MAX_AGE_MS := 200;
     CONST num VALID_S := 0.5;   ! from the image to the moment of setting off
     VAR socketdev vision;
+    VAR bool connected := FALSE;
     VAR string picked := "";   ! what the server has not been told yet
     VAR num newest := 0;       ! number of its newest result when that was accepted
 
     PROC main()
-        Connect;
         WHILE TRUE DO
-            PickOne;
+            IF connected THEN
+                PickOne;
+            ELSE
+                Connect;
+            ENDIF
         ENDWHILE
     ERROR
-        ! Whatever broke the connection: nothing received before counts any more.
+        ! Whatever broke the connection: nothing received before counts any more. The loop connects
+        ! again, as often as it takes: RAPID does not recover from errors that occur in here.
         StopMove;
         SocketClose vision;
+        connected := FALSE;
         WaitTime 1;
         StartMove;
-        Connect;
         TRYNEXT;
     ENDPROC
 
@@ -44,6 +49,7 @@ MODULE MushroomPicker
             ENDIF
             picked := "";
         ENDIF
+        connected := TRUE;
     ENDPROC
 
     ! One line out, one line in. The server never speaks unasked.

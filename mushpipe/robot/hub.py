@@ -201,8 +201,9 @@ class Hub:
         """Return the targets nobody has claimed, best first."""
         choice = result.choice
         self._places.look(choice, self.ledger.claimed())
-        shown = (t for t in choice.targets if not self.ledger.hides(t.id))
-        return [t for t in shown if not self._places.taken(t, choice.frame)]
+        shown = [t for t in choice.targets if not self.ledger.hides(t.id)]
+        taken = self._places.taken(shown, choice.frame).tolist()
+        return [t for t, gone in zip(shown, taken, strict=True) if not gone]
 
     def offered(self, result: Result) -> list[Target]:
         """Return the first targets nobody has claimed, as many as may be sent."""
@@ -240,8 +241,8 @@ class Hub:
             self.fresh(now, self.settings.max_age_s)
         self._look()
         choice = self.newest.choice if self.newest else Choice("", (), {})
-        known = (t for t in choice.targets if t.id == target)
-        visible = any(not self._places.taken(t, choice.frame) for t in known)
+        known = [t for t in choice.targets if t.id == target]
+        visible = not self._places.taken(known, choice.frame).all()
         effect = self.ledger.apply(owner, target, outcome, hold_s, visible, now)
         self._look()
         return effect

@@ -7,9 +7,11 @@ off may be offered once more: a camera on the arm sees other mushrooms there bef
 
 from __future__ import annotations
 
-import math
-from collections.abc import Set
+from collections.abc import Sequence, Set
 
+import numpy as np
+
+from mushpipe.core.arrays import Bools
 from mushpipe.robot.targets import Choice, Target
 
 USUAL_M = 0.04  # diameter of a target of which none is known
@@ -30,12 +32,22 @@ class Places:
             if target.id in claimed:
                 self._claimed[target.id] = target, choice.frame, self._largest
 
-    def taken(self, target: Target, frame: str) -> bool:
-        """Whether a target came up within half a diameter of where a claimed one was last seen."""
-        return any(
-            target.id > largest
-            and frame == known_frame
-            and math.dist(target.row[:3], known.row[:3])
-            < (max(target.row[7], known.row[7]) or USUAL_M) / 2
+    def taken(self, targets: Sequence[Target], frame: str) -> Bools:
+        """Return which targets came up within half a diameter of where a claimed one was last seen.
+
+        All at once: a robot that accepts whatever it sees claims thousands, and the others are
+        served meanwhile.
+        """
+        claimed = [
+            (*known.row[:3], known.row[7], largest)
             for known, known_frame, largest in self._claimed.values()
-        )
+            if known_frame == frame and largest < self._largest  # else nothing came up since
+        ]
+        if not claimed or not targets:
+            return np.zeros(len(targets), bool)
+        old = np.array(claimed)
+        new = np.array([(*target.row[:3], target.row[7], target.id) for target in targets])
+        apart = sum((new[:, i, None] - old[:, i]) ** 2 for i in range(3))
+        size = np.maximum(new[:, 3, None], old[:, 3])
+        near = apart < (np.where(size > 0, size, USUAL_M) / 2) ** 2
+        return np.asarray((near & (new[:, 4, None] > old[:, 4])).any(axis=1))

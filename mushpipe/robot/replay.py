@@ -18,10 +18,10 @@ from mushpipe.robot.transcript import Line, read_transcript
 Show = Callable[[str, bytes], None]
 """Is told of every line: ``>`` what we send, ``<`` what we get."""
 SILENCE_S = 15.0
-_REFUSAL = orjson.dumps({
+_REFUSAL = {
     "op": "error", "id": None, "code": "replay_refused", "fatal": True, "replay": True,
     "message": "this is a recording; a client that wants it says accept_replay",
-})  # fmt: skip
+}  # fmt: skip
 
 
 def lines_of(path: Path, client: int | None = None) -> tuple[list[Line], list[str]]:
@@ -167,7 +167,7 @@ def _answers(lines: Iterable[Line], asked: _Asked) -> Iterator[bytes]:
                 return
             greeted = (_object(request) or {}).get("accept_replay") is True
             if not greeted:
-                yield _REFUSAL
+                yield orjson.dumps({**_REFUSAL, "t_ms": body.get("t_ms", 0)})
                 return
         if body.get("id") is not None:
             body["id"] = asked.next_id()

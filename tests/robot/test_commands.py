@@ -21,6 +21,7 @@ from mushpipe.robot import commands
 from mushpipe.robot.client import RobotClient
 from mushpipe.robot.replay import as_server, lines_of
 from tests.cli.shell import MAIN
+from tests.robot.peer import Peer
 from tests.robot.scene import bench
 from tests.robot.test_transcript import record
 
@@ -183,8 +184,12 @@ def test_a_recording_is_replayed_to_nobody_who_does_not_accept_it(tmp_path: Path
         target=as_server, args=(lines, 0, lambda *_: None, port.put), daemon=True
     )
     thread.start()
-    with pytest.raises(PermissionError, match="replay_refused"):
-        RobotClient(port=port.get(timeout=20))
+    with Peer(port.get(timeout=20)) as peer:  # which holds every line to the schema
+        heard = peer.read()
+        peer.say("hello", version="1.0", mode="request")
+        (refusal,) = peer.rest()
+    assert refusal["code"] == "replay_refused"
+    assert refusal["t_ms"] >= heard["t_ms"]
     thread.join(20)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 
@@ -131,3 +133,24 @@ def test_a_claim_in_another_frame_hides_nothing() -> None:
     scene.say("a", 1, "accepted")
     moved = bed(3)
     assert scene.show(Choice("robot_base", moved.targets, moved.withheld)) == [3, 4, 5]
+
+
+def test_a_robot_that_accepts_all_it_sees_keeps_the_server_from_nobody() -> None:
+    """Each new target was held against each claimed one, in Python: longer than a frame takes."""
+    scene, steps = Scene(), 0
+
+    def count(*_: object) -> None:
+        nonlocal steps
+        steps += 1
+
+    for block in range(12):  # each elsewhere, and gone when the next one comes
+        ids = np.arange(100 * block, 100 * block + 100)
+        scene.show(choice(100, id=ids, position=np.tile([block, 0.0, 0.5], (100, 1))))
+        for target in ids.tolist() if block < 11 else ():
+            scene.say("a", target, "accepted")
+    assert scene.hub.newest is not None
+    sys.setprofile(count)
+    free = scene.hub.free(scene.hub.newest)
+    sys.setprofile(None)
+    assert len(free) == 100
+    assert steps < 10_000  # calls and returns

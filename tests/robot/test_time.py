@@ -33,7 +33,7 @@ def test_a_stamp_is_placed_where_it_was_taken() -> None:
 
 
 @pytest.mark.parametrize("jump", [-3600.0, -30.0, 0.5, 3600.0])
-def test_a_jump_of_the_wall_clock_changes_no_age(jump: float) -> None:
+def test_a_jump_of_the_wall_clock_makes_nothing_younger(jump: float) -> None:
     clock = FakeClock()
     placer = Placer(clock)
     clock.now += 60
@@ -41,11 +41,24 @@ def test_a_jump_of_the_wall_clock_changes_no_age(jump: float) -> None:
     before = clock.wall_ns()
     clock.now += 0.1
     clock.offset_s += jump
-    assert placer.place(before) == pytest.approx(clock.now - 0.1, abs=1e-5)
+    # Reckoned back after the jump, the same stamp would be of an earlier moment.
+    assert placer.place(before) == pytest.approx(clock.now - 0.1 - max(jump, 0), abs=1e-5)
     clock.now += 0.1
     after = clock.wall_ns()
     clock.now += 0.2
     assert placer.place(after) == pytest.approx(clock.now - 0.2, abs=1e-5)
+
+
+@pytest.mark.parametrize("jump", [-0.3, 0.3, 0.6])
+def test_a_driver_may_reckon_a_stamp_back_from_now_after_the_clock_was_set(jump: float) -> None:
+    clock = FakeClock()
+    placer = Placer(clock)
+    clock.now += 60
+    placer.place(0)
+    clock.offset_s += jump
+    placed = placer.place(clock.wall_ns() - 700_000_000)
+    assert placed is not None
+    assert placed <= clock.now - 0.7 + 1e-5
 
 
 def test_an_hour_that_the_clock_showed_twice_counts_as_the_first_one() -> None:
