@@ -99,16 +99,17 @@ verifier: $(STAMP)-dev system-libraries
 # into one. `train` makes one from nothing on two cores within an hour: frames, network, figures;
 # `train-seeds` adds two that tell how much chance there is. There a training takes one core, and half
 # of another to cut its crops; meanwhile the one that ships is judged, which renders the frames for
-# it. PyTorch for the CPU comes from PyTorch's own index; elsewhere `torch` would bring CUDA along.
+# it. `train-tables` trains the one that ships on, at tables: an hour on two cores. PyTorch for the
+# CPU comes from PyTorch's own index; elsewhere `torch` would bring CUDA along.
 NET := out/net
 CORES := $(shell nproc)
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
-render = for part in $$(seq $(CORES)); do $(BIN)/python -m training.net.scenes --frames $(1) \
+render = for part in $$(seq $(CORES)); do $(BIN)/python -m training.net.scenes $(1) \
   --part $$((part - 1)) --of $(CORES) & pids="$$pids $$!"; done; for pid in $$pids; do wait $$pid || exit 1; done
-.PHONY: train train-seeds train-taught
+.PHONY: train train-seeds train-taught train-tables
 train: $(STAMP) system-libraries
 	$(INSTALL) --editable '.[train]' --extra-index-url $(TORCH_INDEX)
-	$(call render,640)
+	$(call render,--frames 640)
 	nice $(BIN)/python -m training.net.judge > $(NET)/shipped.txt & \
 	  OMP_NUM_THREADS=1 $(MAKE) --always-make $(NET)/seed-1.onnx && wait
 	$(BIN)/python -m training.net.judge --peers --models $(NET)/seed-1.onnx
@@ -119,13 +120,21 @@ train-seeds: train
 
 train-taught: $(STAMP) system-libraries
 	$(INSTALL) --editable '.[train]'
-	$(call render,2000)
+	$(call render,--frames 2000)
 	$(BIN)/python -m training.net.taught --out $(NET)
 	$(BIN)/python -m training.net.joined --weights $(NET)/taught-1.pt $(NET)/taught-0.pt $(NET)/taught-2.pt
 	for name in taught-0 taught-1 taught-2 joined; do $(BIN)/python -m training.net.export \
 	  --weights $(NET)/$$name.pt --out $(NET)/$$name.onnx || exit 1; done
 	$(BIN)/python -m training.net.judge --peers \
 	  --models $(NET)/taught-0.onnx $(NET)/taught-1.onnx $(NET)/taught-2.onnx $(NET)/joined.onnx
+
+train-tables: $(STAMP) system-libraries
+	$(INSTALL) --editable '.[train]' --extra-index-url $(TORCH_INDEX)
+	$(call render,--tables)
+	$(BIN)/python -m training.net.tables --start mushpipe/stages/cap_net.onnx
+	$(BIN)/python -m training.net.export --out $(NET)/tables.onnx \
+	  --weights $(NET)/tables-3000.pt $(NET)/tables-4500.pt $(NET)/tables-5500.pt
+	$(BIN)/python -m training.net.judge --models mushpipe/stages/cap_net.onnx $(NET)/tables.onnx
 
 $(NET)/seed-%.onnx:
 	$(BIN)/python -m training.net.train --seed $* --out $(NET)/seed-$*.pt

@@ -46,6 +46,18 @@ def test_circles_of_a_crop_lie_on_its_caps(seed: int) -> None:
     assert (target[MASK][disc] > 0.9).all()
 
 
+def test_a_plain_crop_keeps_light_and_colour_nearly() -> None:
+    for seed in range(8):
+        usual = crop(picture(), 224, np.random.default_rng(seed))
+        plain = crop(picture(), 224, np.random.default_rng(seed), plain=1)
+        assert (plain[1] == usual[1]).all()
+        assert (plain[2] == usual[2]).all()
+        inside = np.kron(plain[1][MASK] > 0.99, np.ones((4, 4), bool))
+        if inside.any():
+            red, green, blue = np.median(plain[0][:, inside], axis=1)
+            assert max(red, green, blue) < 1.5 * min(red, green, blue)
+
+
 def test_stains_change_images_and_never_targets() -> None:
     changed = 0
     for seed in range(8):

@@ -23,6 +23,7 @@ def crop(
     near: float = 0.0,
     stained: bool = False,
     surfaces: bool = False,
+    plain: float = 0.0,
 ) -> tuple[Singles, Singles, Singles]:
     """Return an image (3, size, size) in 0..1, its target (5, h, w) and weight (h, w).
 
@@ -33,6 +34,7 @@ def crop(
         near: Share of the crops that are taken around a cap; the others lie anywhere.
         stained: Whether caps and bed may be blotched, overexposed, and set one against the other.
         surfaces: Whether they may have other surfaces, shade each other, and be blurred more.
+        plain: Share of the crops that stay much as they are.
     """
     matrix, scale = _placement(picture, size, rng, near)
     color = cv2.warpAffine(
@@ -45,7 +47,10 @@ def crop(
     circles = np.column_stack([center, picture.circles[:, 2] * scale])
     if surfaces:
         image = textured(image, cap, circles, rng)
-    image = photographed(image, cap, rng, stained, surfaces)
+    if plain and rng.random() < plain:
+        image = snapshot(image, rng)
+    else:
+        image = photographed(image, cap, rng, stained, surfaces)
     stump = picture.kind == Ignore.CUT_STUMP
     target, weight = aims(circles[~stump], (picture.visible < HIDDEN)[~stump], size // STRIDE)
     target[MASK] = cv2.resize(cap, None, fx=1 / STRIDE, fy=1 / STRIDE, interpolation=cv2.INTER_AREA)
@@ -99,6 +104,16 @@ def aims(circles: Floats, unsure: Bools, cells: int) -> tuple[Singles, Singles]:
         target[OFFSET.start][nearer], target[OFFSET.start + 1][nearer] = dx[nearer], dy[nearer]
         weight[heat > 0.3] = 1
     return target, weight
+
+
+def snapshot(image: Singles, rng: np.random.Generator) -> Singles:
+    """Return an image (H, W, 3) a little brighter or darker, less sharp and noisier."""
+    image = image * np.exp(rng.normal(0, 0.25) + rng.normal(0, 0.05, 3)).astype(np.float32)
+    image = np.clip(image, 0, 1) ** np.float32(np.exp(rng.normal(0, 0.12)))
+    if rng.random() < 0.3:
+        image = np.asarray(cv2.GaussianBlur(image, (0, 0), float(rng.uniform(0.3, 1.2))))
+    noise = rng.standard_normal(image.shape, np.float32) * np.float32(rng.exponential(0.008))
+    return np.asarray(np.clip(image + noise, 0, 1), np.float32)
 
 
 def photographed(

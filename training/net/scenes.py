@@ -22,7 +22,11 @@ from training.scenes import Case, stored
 TRAINING_SEED, TABLES_SEED, VALIDATION_SEED, JUDGING_SEED = 200_000, 201_000, 300_000, 400_000
 VERIFIER_SEED, CHOOSING_SEED = 500_000, 510_000  # family a
 SPARSE_SEED, SPARSE_JUDGING_SEED = 600_000, 610_000
+CLUTTERED_SEED, LONE_SEED = 630_000, 632_000
 TRAINING, VALIDATION = 640, 60
+# What `training.net.tables` learns from: frames of the training, and tables with few caps.
+FAMILIAR = [seed + k for seed in (TRAINING_SEED, TABLES_SEED) for k in range(250)]
+CLUTTERED = [*range(CLUTTERED_SEED, CLUTTERED_SEED + 600), *range(LONE_SEED, LONE_SEED + 700)]
 
 
 @dataclass(frozen=True)
@@ -126,6 +130,34 @@ def sparse(seed: int) -> dict[str, Any]:
     }
 
 
+def cluttered(seed: int) -> dict[str, Any]:
+    """Draw the settings of a table with few caps and more of other things.
+
+    From `LONE_SEED` on there are two caps at most.
+    """
+    drawn, rng = settings(seed), np.random.default_rng([seed, 10])
+    color = drawn["cap_color"]
+    drawn |= {
+        "scene": "lab",
+        "count": int(rng.integers(0, 7)),
+        "clutter": int(rng.integers(3, 14)),
+        "table": str(rng.choice(["wood", "cloth", "paint"])),
+        "pins": 0,
+        "stumps": int(rng.integers(0, 3)),
+        "fallen": int(rng.integers(0, 2)),
+        "lids": 0,
+    }
+    if rng.random() < 0.3:
+        drawn |= {"cap_color": "wood", "printed": True, "size_mm": (25, 60)}
+    elif color == "wood":
+        drawn["cap_color"] = "brown"
+    if seed >= LONE_SEED:
+        rng = np.random.default_rng([seed, 12])
+        drawn |= {"count": int(rng.integers(0, 3)), "clutter": int(rng.integers(5, 14))}
+        drawn["fallen"] = 0
+    return drawn
+
+
 def picture(seed: int, cache: Path) -> Picture:
     """Return a frame, from the cache folder where it was rendered before."""
     path = cache / f"{seed}.npz"
@@ -140,7 +172,8 @@ def picture(seed: int, cache: Path) -> Picture:
 
 
 def _render(seed: int, path: Path) -> None:
-    frame = next(SyntheticSource(**settings(seed)).frames())
+    drawn = cluttered(seed) if seed >= CLUTTERED_SEED else settings(seed)
+    frame = next(SyntheticSource(**drawn).frames())
     truth, instances = frame.attached[TRUTH_TOPIC], frame.attached[INSTANCES_TOPIC]
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_suffix(".part.npz")
@@ -185,11 +218,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cache", type=Path, default=Path("out/net"), help="rendered frames")
     parser.add_argument("--frames", type=int, default=TRAINING, help="to train on")
+    parser.add_argument("--tables", action="store_true", help="those of training.net.tables")
     parser.add_argument("--part", type=int, default=0, help="this process' number")
     parser.add_argument("--of", type=int, default=1, help="how many processes share the work")
     arguments = parser.parse_args()
     seeds = [*range(VALIDATION_SEED, VALIDATION_SEED + VALIDATION)]
-    seeds += range(TRAINING_SEED, TRAINING_SEED + arguments.frames)
+    if arguments.tables:
+        seeds += FAMILIAR + CLUTTERED
+    else:
+        seeds += range(TRAINING_SEED, TRAINING_SEED + arguments.frames)
     for seed in seeds[arguments.part :: arguments.of]:
         picture(seed, arguments.cache)
 
