@@ -8,6 +8,8 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, ClassVar
@@ -175,8 +177,9 @@ def test_a_transcript_whose_replay_nobody_reads_any_more_ends_quietly(tmp_path: 
             assert "NobodyReads" not in done.stderr
 
 
-def test_a_recording_is_replayed_to_nobody_who_does_not_accept_it(tmp_path: Path) -> None:
-    path = tmp_path / "robot.mcap"
+@contextmanager
+def replayed(path: Path) -> Iterator[int]:
+    """The port at which a transcript is replayed to one client."""
     record(path)
     port: SimpleQueue[int] = SimpleQueue()
     lines, _ = lines_of(path)
@@ -184,13 +187,25 @@ def test_a_recording_is_replayed_to_nobody_who_does_not_accept_it(tmp_path: Path
         target=as_server, args=(lines, 0, lambda *_: None, port.put), daemon=True
     )
     thread.start()
-    with Peer(port.get(timeout=20)) as peer:  # which holds every line to the schema
+    yield port.get(timeout=20)
+    thread.join(20)
+
+
+def test_a_recording_is_replayed_to_nobody_who_does_not_accept_it(tmp_path: Path) -> None:
+    with (
+        replayed(tmp_path / "robot.mcap") as port,
+        pytest.raises(PermissionError, match="replay_refused"),
+    ):
+        RobotClient(port=port)
+
+
+def test_the_refusal_of_a_replay_follows_the_schema(tmp_path: Path) -> None:
+    with replayed(tmp_path / "robot.mcap") as port, Peer(port) as peer:  # which checks every line
         heard = peer.read()
         peer.say("hello", version="1.0", mode="request")
         (refusal,) = peer.rest()
     assert refusal["code"] == "replay_refused"
     assert refusal["t_ms"] >= heard["t_ms"]
-    thread.join(20)
 
 
 def test_a_transcript_is_replayed_to_a_server_of_a_recording_that_wants_a_token(
