@@ -66,14 +66,14 @@ def main() -> None:
     guide.to(memory_format=torch.channels_last)
     give_norms(net, (image for image, *_ in islice(batches, MEASURED)))
     net.train()
-    held = slice(ALTERED + PLAIN)
+    held, rest = slice(ALTERED + PLAIN), slice(ALTERED + PLAIN, None)
     learner = Learner(net, RATE, DECAY)
     for step, (image, target, weight) in enumerate(islice(batches, arguments.steps)):
         image = image.to(memory_format=torch.channels_last)
         with torch.no_grad():
             maps = guide(image[held])
         learner.prepare(step, arguments.steps)
-        output, rest = learner.net(image), slice(held.stop, None)
+        output = learner.net(image)
         own = loss_of(output[held], target[held], weight[held])
         led = guided_loss(output[held], maps, target[held])
         seen = loss_of(output[rest], target[rest], weight[rest])
