@@ -67,7 +67,7 @@ class CapNet(Stage):
         "uses it: it needs less of the network, and 0.8 takes two thirds of the time",
     )
     min_score: float = Field(
-        0.509, ge=0, le=1, description="smallest score that is kept; chosen on simulated beds"
+        0.438, ge=0, le=1, description="smallest score that is kept; chosen on simulated beds"
     )
     overlap: float = Field(0.4, ge=0, le=1, description="largest IoU of two circles")
     model: GraphPath | None = Field(None, description="another model than the package's, ONNX")

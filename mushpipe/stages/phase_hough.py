@@ -45,8 +45,9 @@ _STANDING = 0.004  # m; what is higher than this over the bed is looked at, in t
 EVIDENCE = 0.07  # share of an outline that votes; half-hidden caps show hardly more
 _BESIDE = 0.2  # the same beside a network: what has less it sees as well, and fewer cost less time
 _EVERY = 2  # edge points; of so many one votes where network and depth bring candidates as well
-# Of `learned`; without depth, what the network sees less of is no cap. Where it sees few caps, cups
-# are as many as the caps that it doubts, and look like these to the verifier.
+# Of `learned`; what has no depth, and the network sees less of, is no cap. Where it sees few caps,
+# cups are as many as the caps that it doubts, and look like these to the verifier; and where the
+# rest of the frame has depth, nothing that it doubts itself is a cap.
 _SEEN, _SEEN_OF_FEW = 0.1, 0.35
 _SURE = 0.8  # of a network's circle, from which on it is taken for a cap though it has no outline
 _BARE = 0.4  # of such a one where there is depth: it may be a stump, and `cap-fit` can tell
@@ -214,7 +215,8 @@ class PhaseHough(Stage):
             table[:, AT_LEARNED] = agreement(shapes, equal_area_radius(shapes), learned)
         kept = self._plausible(shapes, middle, relief)
         if learned is not None:
-            least = _SEEN if relief.known or many_likely(learned) else _SEEN_OF_FEW
+            few = LIKELY if relief.known else _SEEN_OF_FEW
+            least = _SEEN if many_likely(learned) else few
             kept &= np.isfinite(middle) | (table[:, AT_LEARNED] >= least)
         parts = (shapes[kept], hits[kept], table[kept], middle[kept])
         return Evidence(edges, *parts, relief, radii, known)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mushpipe import Circles, RgbdFrame
+from mushpipe import Circles, Mask, RgbdFrame
 from mushpipe.core.truth import INSTANCES_TOPIC, TRUTH_TOPIC
 from mushpipe.evaluate.matching import circle_iou
 from mushpipe.stages.cap_fit import CapFit
@@ -128,6 +128,25 @@ def test_one_cap_among_clutter_is_found_with_depth_and_hardly_a_cup_is_fitted() 
         score.add(circles, truth, counted(truth, *RADII))
     assert score.right >= 10
     assert score.false <= 3  # 7 where one model decides about beds and tables
+
+
+@pytest.mark.parametrize(("score", "found"), [(0.45, 0), (0.6, 1)])
+def test_what_is_seen_by_a_doubtful_network_alone_is_no_cap_where_there_are_few(
+    score: float, found: int
+) -> None:
+    frame = simulated(83, width=640, height=480, count=1, size_mm=(40, 50), pins=0)
+    truth = frame.attached[TRUTH_TOPIC]
+    row = int(np.argmax(truth.radius))
+    y, x = np.indices(frame.color.shape[:2])
+    away = np.hypot(x - truth.center[row, 0], y - truth.center[row, 1])
+    assert frame.depth is not None
+    blind = replace(frame, depth=np.where(away < 2 * truth.radius[row], 0, frame.depth))
+    one = Circles(truth.center[[row]], truth.radius[[row]], np.array([score]))
+    mask = Mask(away < truth.radius[row])
+    detect = PhaseHough(radius_px=(8, None), use_learned=True)
+    circles = detect.process(blind, mask, one)
+    within = np.linalg.norm(circles.center - truth.center[row], axis=1) < truth.radius[row]
+    assert within.sum() == found
 
 
 @pytest.mark.parametrize(
