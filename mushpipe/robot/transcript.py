@@ -28,7 +28,7 @@ PREFIX = "/robot/"
 FLUSH_S = 2.0
 MOST_BYTES = 64 * 1024 * 1024
 # A wrong token may be the right one of another server, or nearly that of this one.
-_TOKEN = re.compile(rb'("token"\s*:\s*")(?:[^"\\]|\\.)*')
+_TOKEN = re.compile(rb'("token"\s*:\s*")(?:[^"\\]|\\.)*|(,TOKEN=)[^,]*')
 SCHEMA = wire.json_schema(
     "mushpipe.RobotLine",
     {
@@ -71,7 +71,7 @@ class Transcript:
 
     def observe(self, kind: Kind, client: int, text: bytes) -> None:
         """Take a line; no token that a client tries is kept."""
-        text = _TOKEN.sub(rb"\1***", text)
+        text = _TOKEN.sub(rb"\1\2***", text)
         if self._secret:
             text = text.replace(self._secret, b"***")
         with self._lock:
