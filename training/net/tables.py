@@ -25,7 +25,7 @@ from training.net.scenes import CLUTTERED, FAMILIAR, Picture, picture, settings
 from training.net.taught import STAINED
 from training.net.train import NEAR, SIZE, Crops, Learner
 
-STEPS, RATE, DECAY = 5500, 1.2e-3, 0.998
+STEPS, RATE = 5500, 1.2e-3
 KEPT = (3000, 4500)  # steps after which weights are kept as well; the network is the mean of all
 ALTERED, PLAIN, TABLES = 6, 3, 7  # crops of a step: beds in any light, in plain light; tables
 LIGHT = 0.6  # share of the latter two in plain light
@@ -67,7 +67,7 @@ def main() -> None:
     give_norms(net, (image for image, *_ in islice(batches, MEASURED)))
     net.train()
     held, rest = slice(ALTERED + PLAIN), slice(ALTERED + PLAIN, None)
-    learner = Learner(net, RATE, DECAY)
+    learner = Learner(net, RATE)
     for step, (image, target, weight) in enumerate(islice(batches, arguments.steps)):
         image = image.to(memory_format=torch.channels_last)
         with torch.no_grad():
