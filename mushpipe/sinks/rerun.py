@@ -233,7 +233,7 @@ class RerunSink(Sink):
             log_layers(self._recording, layers, stages)
             camera = trace.frame.camera
             spread = camera.width / (2 * camera.fx) if camera else 0.0
-            self._recording.send_blueprint(layout(layers, distance, spread))
+            self._recording.send_blueprint(layout(layers, stages, distance, spread))
         return stages
 
     def _write_notes(self, rr: Any) -> None:

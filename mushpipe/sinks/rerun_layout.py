@@ -22,28 +22,34 @@ HIDDEN_AT_FIRST = (FRAMES, INITIAL, CIRCLES)
 NARROW = 0.55  # half the width of a bed, in distances, that is seen whole from 0.94 distances away
 
 
-def layout(layers: Sequence[str], distance: float | None, spread: float) -> Any:
+def layout(
+    layers: Sequence[str], stages: Sequence[str], distance: float | None, spread: float
+) -> Any:
     """Return the blueprint of a run.
 
     Args:
         layers: Entities of the image that the run's stages fill, in drawing order. Of the masks
             the last is shown; every layer can be switched in the panel at the left.
+        stages: Whose time is plotted; none for a recording that is only looked at.
         distance: From the camera to the bed, m, for the first look from the side; None where
             there is no depth, and so nothing to show in space.
         spread: Half the width that the camera sees, in distances.
     """
     import rerun.blueprint as rrb
 
-    plots = [
-        rrb.TimeSeriesView(origin=COUNTS, name="Mushrooms"),
-        rrb.TimeSeriesView(origin=TIMES, name="Time per stage, ms"),
-    ]
+    plots = []
+    if PICKS in layers:
+        plots.append(rrb.TimeSeriesView(origin=COUNTS, name="Mushrooms"))
+    if stages:
+        plots.append(rrb.TimeSeriesView(origin=TIMES, name="Time per stage, ms"))
     right = [rrb.TextLogView(origin=LOG, name="Log")]
     if distance is not None:
         plots.append(rrb.TimeSeriesView(origin=VALIDITY, name="Depth valid, %"))
         holes = rrb.Spatial2DView(origin=IMAGE, name="Depth, holes red", contents=[DEPTH, HOLES])
         right = [_space_view(distance, spread), holes, *right]
-    left = rrb.Vertical(_image_view(layers), rrb.Horizontal(*plots), row_shares=[3, 1])
+    left = _image_view(layers)
+    if plots:
+        left = rrb.Vertical(left, rrb.Horizontal(*plots), row_shares=[3, 1])
     return rrb.Blueprint(
         rrb.Horizontal(
             left, rrb.Vertical(*right, row_shares=[3, 2, 1][: len(right)]), column_shares=[3, 2]
