@@ -89,10 +89,11 @@ test-lowest: system-libraries
 	  --deselect tests/stages/test_learned_chain.py::test_what_is_hardly_a_cap
 
 # Weights of the verifiers of detector and cap fit, from simulated scenes alone; rendering takes minutes.
+# For another network BESIDE=--beside trains those beside one, and leaves the others as they are.
 .PHONY: verifier
 verifier: $(STAMP)-dev system-libraries
-	$(BIN)/python -m training.verifier
-	$(BIN)/python -m training.fitted
+	$(BIN)/python -m training.verifier $(BESIDE)
+	$(BIN)/python -m training.fitted $(BESIDE)
 
 # Networks of `cap-net`. The one that ships takes two targets. `train-taught`: three seeds taught by a
 # large one, eleven minutes of training on a GPU that PyTorch knows, beside 15 cores that cut crops,

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import yaml
 
 from mushpipe import Circles, RgbdFrame
 from mushpipe.core.arrays import Bools, Floats
@@ -24,6 +25,7 @@ from mushpipe.evaluate.matching import circle_iou
 from mushpipe.stages.cap.batch import Fits
 from mushpipe.stages.cap.kin import Kin, sure_of, tones_of, unlike
 from mushpipe.stages.cap.verify import (
+    ALONE,
     BESIDE,
     FEW,
     FILE,
@@ -175,6 +177,7 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, default=Path("out/scenes"), help="rendered frames")
     parser.add_argument("--out", type=Path, default=Path(f"mushpipe/stages/{FILE}"))
     parser.add_argument("--ridge", type=float, default=1e-3)
+    parser.add_argument("--beside", action="store_true", help="only the models beside `cap-net`")
     arguments = parser.parse_args()
     cache, ridge = arguments.cache, arguments.ridge
     varied = varied_cases(cache, VERIFIER_SEED, "a", VARIED)
@@ -183,14 +186,17 @@ def main() -> None:
     lone += found(few_cases(cache), stumps=True)
     sparse = found(sparse_cases(cache, SPARSE_SEED, "a", SPARSE), stumps=True)
     learnt = {FEW: samples(lone), RUBBLE: samples([*lone, *sparse])}
-    models = {
+    known = yaml.safe_load(arguments.out.read_text())["models"] if arguments.beside else {}
+    models = {name: known[name] for name in ALONE if name in known}
+    models |= {
         name: taught(name, rows, ridge)
         for model, rows in learnt.items()
         for name in (model, model + BESIDE)
+        if name not in models
     }
     weights = {name: weights_of(model, NAMES) for name, model in models.items()}
-    known = samples(usual, weights)
-    models |= {name: taught(name, known, ridge) for name in MODELS if name not in models}
+    rows = samples(usual, weights)
+    models |= {name: taught(name, rows, ridge) for name in MODELS if name not in models}
     write({name: models[name] for name in MODELS}, arguments.out, HEAD)
 
 

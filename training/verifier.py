@@ -228,17 +228,31 @@ def first_guess(names: tuple[str, ...]) -> Parts:
     return {"mean": np.full(len(a), 0.5), "scale": np.ones(len(a)), "a": a, "b3": np.zeros(1)}
 
 
-def train(cache: Path, out: Path, rounds: int) -> None:
+def kept(path: Path) -> Trained:
+    """Return the models of a file that another `cap-net` changes nothing about."""
+    parts: dict[str, Parts] = {name: {} for name in FEATURES if not name.endswith(LEARNED)}
+    with np.load(path) as file:
+        for name, part in (key.split("/") for key in file):
+            if name in parts:
+                parts[name][part] = file[f"{name}/{part}"]
+    return {name: (each.pop("features").tolist(), each) for name, each in parts.items()}
+
+
+def train(cache: Path, out: Path, rounds: int, beside: bool) -> None:
     """Train all models and write them; networks have teachers in the last round.
 
-    Discs from depth alone are left out: hardly any is a cap that no edges voted for, and learning
-    from them cost 0.1 to 0.2 points of F on the frames for choosing.
+    `beside` trains those beside `cap-net` alone. Discs from depth alone are left out: hardly any is
+    a cap that no edges voted for, and learning from them cost 0.1 to 0.2 points of F on the frames
+    for choosing.
     """
     cases = [*prepared(cache)]
     models: Trained = {name: (known, first_guess(known)) for name, known in FEATURES.items()}
+    models |= kept(out) if beside else {}
     write_models(out, models)
     for turn in range(rounds):
         for settings, name in PASSES:
+            if beside and not name.endswith(LEARNED):
+                continue
             stage = PhaseHough(radius_px=RADII, verifier=out, use_blobs=False, **settings)
             deep, known = name.startswith("depth"), FEATURES[name]
             table, right = samples(stage, [case for case in cases if teaches(case, name)], deep)
@@ -270,8 +284,9 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, default=Path("out/scenes"), help="rendered frames")
     parser.add_argument("--out", type=Path, default=Path(f"mushpipe/stages/{FILE}"))
     parser.add_argument("--rounds", type=int, default=4)
+    parser.add_argument("--beside", action="store_true", help="only the models beside `cap-net`")
     arguments = parser.parse_args()
-    train(arguments.cache, arguments.out, arguments.rounds)
+    train(arguments.cache, arguments.out, arguments.rounds, arguments.beside)
 
 
 if __name__ == "__main__":

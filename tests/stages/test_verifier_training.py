@@ -19,7 +19,16 @@ from training.matching import counted
 from training.net.scenes import cap_mask
 from training.scenes import Case
 from training.sensors import worse
-from training.verifier import FEATURES, NET, RADII, doubtful, first_guess, fit_logistic, fit_network
+from training.verifier import (
+    FEATURES,
+    NET,
+    RADII,
+    doubtful,
+    first_guess,
+    fit_logistic,
+    fit_network,
+    kept,
+)
 
 
 def test_a_doubtful_network_finds_fewer_circles_with_lower_scores_and_no_others() -> None:
@@ -188,3 +197,20 @@ def test_the_first_guess_of_every_model_likes_edges_and_dislikes_overlap(tmp_pat
         chance = [probability(each, models, 0, *room) for each in (hidden, row, edge)]
         assert chance == sorted(chance)
         assert chance[0] < chance[1] < chance[2]
+
+
+def test_another_network_changes_no_model_that_knows_of_none(tmp_path: Path) -> None:
+    path, again = tmp_path / "models.npz", tmp_path / "again.npz"
+    models = {name: (known, first_guess(known)) for name, known in FEATURES.items()}
+    for number, (_, parts) in enumerate(models.values()):
+        parts["b3"] += number
+    write_models(path, models)
+    same = kept(path)
+    assert {name: tuple(known) for name, (known, _) in same.items()} == {
+        name: FEATURES[name] for name in ("image", "depth", "mask")
+    }
+    write_models(again, same)
+    for name, known in FEATURES.items():
+        if name in same:
+            old, new = (read_models(each, [name], known) for each in (path, again))
+            assert all(map(np.array_equal, old, new))
