@@ -171,6 +171,12 @@ def taught(model: str, samples: tuple[Floats, Floats], ridge: float) -> dict[str
     return fit(table, right, names, ridge, LIMIT, SQUARED if share else (), share)
 
 
+def kept(path: Path) -> dict[str, Any]:
+    """Return the models of a file that another `cap-net` changes nothing about."""
+    models = yaml.safe_load(path.read_text(encoding="utf-8"))["models"]
+    return {name: models[name] for name in ALONE}
+
+
 def main() -> None:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -186,8 +192,7 @@ def main() -> None:
     lone += found(few_cases(cache), stumps=True)
     sparse = found(sparse_cases(cache, SPARSE_SEED, "a", SPARSE), stumps=True)
     learnt = {FEW: samples(lone), RUBBLE: samples([*lone, *sparse])}
-    known = yaml.safe_load(arguments.out.read_text())["models"] if arguments.beside else {}
-    models = {name: known[name] for name in ALONE if name in known}
+    models = kept(arguments.out) if arguments.beside else {}
     models |= {
         name: taught(name, rows, ridge)
         for model, rows in learnt.items()

@@ -247,11 +247,12 @@ def train(cache: Path, out: Path, rounds: int, beside: bool) -> None:
     """
     cases = [*prepared(cache)]
     models: Trained = {name: (known, first_guess(known)) for name, known in FEATURES.items()}
-    models |= kept(out) if beside else {}
+    fixed = kept(out) if beside else {}
+    models |= fixed
     write_models(out, models)
     for turn in range(rounds):
         for settings, name in PASSES:
-            if beside and not name.endswith(LEARNED):
+            if name in fixed:
                 continue
             stage = PhaseHough(radius_px=RADII, verifier=out, use_blobs=False, **settings)
             deep, known = name.startswith("depth"), FEATURES[name]
