@@ -54,7 +54,7 @@ NEUTRAL = 0.3  # IoU with a mushroom that need not be found, from which on a cir
 SETTINGS = [
     {"use_learned": net, "use_depth": deep} for deep in (True, False) for net in (False, True)
 ]
-SQUARED = ("misfit", "tilt", "aspect", "lean")  # by models of lone circles
+SQUARED = ("misfit", "tilt", "aspect", "lean")
 # So much of what a lone circle's models are asked is a cap; in their training it is less, which
 # would lose caps that a stereo camera shows badly. Both of them must take it for one.
 SHARE = {FEW: 0.9, RUBBLE: 0.6}
@@ -168,7 +168,7 @@ def taught(model: str, samples: tuple[Floats, Floats], ridge: float) -> dict[str
     rows, right = (part[teaches(samples[0], model)] for part in samples)
     print(f"{model}: {len(rows)} circles, {right.mean():.2f} right")
     table = rows[:, [NAMES.index(name) for name in names]]
-    return fit(table, right, names, ridge, LIMIT, SQUARED if share else (), share)
+    return fit(table, right, names, ridge, LIMIT, SQUARED, share)
 
 
 def kept(path: Path) -> dict[str, Any]:
