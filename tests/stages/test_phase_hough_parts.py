@@ -348,6 +348,27 @@ def test_of_likely_rivals_the_one_that_a_network_agrees_with_comes_first(likely:
     assert order.tolist() == (first_agreed if likely else last_given)
 
 
+@pytest.mark.parametrize(("surer", "first"), [(0.99, "surer"), (0.85, "agreed")])
+def test_a_rival_that_is_surer_by_far_comes_before_one_that_a_network_agrees_with(
+    surer: float, first: str
+) -> None:
+    """A circle that spans two caps looks like one to the network, too."""
+    image = discs([(40, 60, 15), (62, 60, 14), (90, 40, 12)], 0.8, 0.15)
+    found = PhaseHough().gather(frame_of(image), Mask(image > 0.5))
+    assert found is not None
+    n = len(found.shapes)
+    agreed = np.arange(n) < n // 2
+    found.table[:, NAMES.index(LEARNED)] = np.where(agreed, 0.9, 0.5)
+    alike = Models(*(np.zeros_like(part) for part in load_verifier()))
+    logits = np.zeros_like(alike.b3)
+    logits[0], logits[2] = np.log(0.8 / 0.2), np.log(surer / (1 - surer))
+    alike = alike._replace(scale=alike.scale + 1, b3=logits)
+    which = np.where(agreed, 0, 2).astype(np.int32)
+    parts = (found.edges, found.shapes, found.hits, found.table)
+    order, *_ = decide(*parts, which, alike, least=0.3, led=True)
+    assert agreed[order[0]] == (first == "agreed")
+
+
 @pytest.mark.parametrize("doubted", [0.1, 0.3])
 def test_what_depth_alone_is_against_comes_first_where_image_and_network_are_sure(
     doubted: float,

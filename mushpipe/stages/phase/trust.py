@@ -58,11 +58,12 @@ def _leads(k: int, shapes: Floats, alone: Floats, beside: Ints32) -> bool:
 @borrower
 def mixed(trusted: float, alone: float, trust: float) -> float:
     """Return a probability whose logit lies between those of two, by the trust in the first."""
-    logit = trust * _logit(trusted) + (1 - trust) * _logit(alone)
-    return float(1 / (1 + math.exp(-logit)))
+    both = trust * logit(trusted) + (1 - trust) * logit(alone)
+    return float(1 / (1 + math.exp(-both)))
 
 
 @borrower
-def _logit(chance: float) -> float:
+def logit(chance: float) -> float:
+    """Return the logarithm of the odds, finite at 0 and 1."""
     chance = min(max(chance, 1e-9), 1 - 1e-9)
     return math.log(chance / (1 - chance))
