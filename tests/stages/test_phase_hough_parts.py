@@ -29,7 +29,7 @@ from mushpipe.stages.phase.strips import Strips, in_strips
 from mushpipe.stages.phase.verifier import load_verifier
 from mushpipe.stages.phase.votes import GAP, peaks, phase_of, rings_between, summed, vote
 from mushpipe.stages.phase_hough import PhaseHough, equal_area_radius
-from mushpipe.stages.verifier_net import Models
+from tests.stages.indifferent import indifferent
 from tests.stages.scenes import discs, frame_of, sphere_depth
 
 ALL = np.ones((120, 160), np.uint8)
@@ -338,12 +338,10 @@ def test_of_likely_rivals_the_one_that_a_network_agrees_with_comes_first(likely:
     assert found is not None
     n = len(found.shapes)
     found.table[:, NAMES.index(LEARNED)] = np.linspace(0.9, 0.2, n)
-    alike = Models(*(np.zeros_like(part) for part in load_verifier()))
-    logit = np.float32(0.4 if likely else -0.4)
-    alike = alike._replace(scale=alike.scale + 1, b3=alike.b3 + logit)
+    models = indifferent(*4 * [0.4 if likely else -0.4])
     which = np.zeros(n, np.int32)
     parts = (found.edges, found.shapes, found.hits, found.table)
-    order, *_ = decide(*parts, which, alike, least=0.3, led=True)
+    order, *_ = decide(*parts, which, models, least=0.3, led=True)
     first_agreed, last_given = list(range(n)), list(range(n))[::-1]
     assert order.tolist() == (first_agreed if likely else last_given)
 
@@ -359,13 +357,10 @@ def test_a_rival_that_is_surer_by_far_comes_before_one_that_a_network_agrees_wit
     n = len(found.shapes)
     agreed = np.arange(n) < n // 2
     found.table[:, NAMES.index(LEARNED)] = np.where(agreed, 0.9, 0.5)
-    alike = Models(*(np.zeros_like(part) for part in load_verifier()))
-    logits = np.zeros_like(alike.b3)
-    logits[0], logits[2] = np.log(0.8 / 0.2), np.log(surer / (1 - surer))
-    alike = alike._replace(scale=alike.scale + 1, b3=logits)
+    models = indifferent(np.log(0.8 / 0.2), 0, np.log(surer / (1 - surer)), 0)
     which = np.where(agreed, 0, 2).astype(np.int32)
     parts = (found.edges, found.shapes, found.hits, found.table)
-    order, *_ = decide(*parts, which, alike, least=0.3, led=True)
+    order, *_ = decide(*parts, which, models, least=0.3, led=True)
     assert agreed[order[0]] == (first == "agreed")
 
 
@@ -380,17 +375,15 @@ def test_what_depth_alone_is_against_comes_first_where_image_and_network_are_sur
     n = len(found.shapes)
     agreed = np.where(np.arange(n) < n // 2, 0.9, 0.2)
     found.table[:, NAMES.index(LEARNED)] = agreed
-    alike = Models(*(np.zeros_like(part) for part in load_verifier()))
-    logits = np.zeros_like(alike.b3)
-    logits[2], logits[[1, 3]] = np.log(0.95 / 0.05), np.log(doubted / (1 - doubted))
-    alike = alike._replace(scale=alike.scale + 1, b3=logits)
+    against = np.log(doubted / (1 - doubted))
+    models = indifferent(0, against, np.log(0.95 / 0.05), against)
     parts = (found.edges, found.shapes, found.hits, found.table)
     which = np.full(n, 3, np.int32)  # all have depth, and a circle of the network
-    order, chance, _, sight = decide(*parts, which, alike, least=0.05, led=True)
+    order, chance, _, sight = decide(*parts, which, models, least=0.05, led=True)
     np.testing.assert_allclose(chance, doubted, rtol=1e-5)
     seen = doubted >= 0.2
     np.testing.assert_allclose(sight, np.where((agreed > 0.8) & seen, 0.95, 0), rtol=1e-5)
     first = list(range(n // 2))[::-1] if seen else []
     assert order[: len(first)].tolist() == first
-    order, _, _, sight = decide(*parts, which, alike, least=0.05, led=False)
+    order, _, _, sight = decide(*parts, which, models, least=0.05, led=False)
     assert not sight.any()

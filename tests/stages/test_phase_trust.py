@@ -10,9 +10,8 @@ from mushpipe.core.arrays import Floats
 from mushpipe.stages.phase.decide import decide, neighbours
 from mushpipe.stages.phase.features import LEARNED, NAMES
 from mushpipe.stages.phase.trust import mixed, trust_in
-from mushpipe.stages.phase.verifier import load_verifier
 from mushpipe.stages.phase_hough import PhaseHough
-from mushpipe.stages.verifier_net import Models
+from tests.stages.indifferent import indifferent
 from tests.stages.scenes import discs, frame_of
 
 
@@ -64,13 +63,10 @@ def test_what_a_blind_network_hardly_sees_is_decided_without_it(
     assert found is not None
     n = len(found.shapes)
     found.table[:, NAMES.index(LEARNED)] = agreement
-    alike = Models(*(np.zeros_like(part) for part in load_verifier()))
-    logits = np.zeros_like(alike.b3)
-    logits[1], logits[3] = np.log(0.96 / 0.04), np.log(0.2 / 0.8)
-    alike = alike._replace(scale=alike.scale + 1, b3=logits)
+    models = indifferent(0, np.log(0.96 / 0.04), 0, np.log(0.2 / 0.8))
     parts = (found.edges, found.shapes, found.hits, found.table)
     which = np.full(n, 3, np.int32)
-    _, chance, *_ = decide(*parts, which, alike, least=0.05, led=True)
+    _, chance, *_ = decide(*parts, which, models, least=0.05, led=True)
     np.testing.assert_allclose(chance, expected, rtol=1e-5)
-    _, chance, *_ = decide(*parts, which, alike, least=0.05, led=False)
+    _, chance, *_ = decide(*parts, which, models, least=0.05, led=False)
     np.testing.assert_allclose(chance, 0.2, rtol=1e-5)

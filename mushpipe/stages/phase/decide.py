@@ -166,7 +166,7 @@ def _first_of(
     best, top = -1, -1.0
     for k in range(len(chance)):
         if waiting[k] and chance[k] >= least:
-            rank = chance[k] - 1
+            rank = chance[k] - 1  # below that of all in which agreement counts
             if led and (chance[k] >= LIKELY or sight[k] > 0):
                 rank = logit(max(chance[k], sight[k])) + LEAD * table[k, AT_LEARNED]
             if rank >= top:
