@@ -36,12 +36,24 @@ def apply_override(document: Document, text: str, label: str = "") -> list[Probl
         target = target.setdefault(key, {})
         if not isinstance(target, dict):
             return [Problem(label, 0, 0, f"'{'.'.join(map(str, at[: depth + 1]))}' has no parts")]
+    before = target.get(at[-1])
+    if (option := _set_by_option(document, at, label)) and before not in (None, value):
+        return [Problem(label, 0, 0, f"{option} sets this to {before}: give one of them")]
     target[at[-1]] = value
     for marks in (document.keys, document.values):  # what the file says there no longer holds
         for place in [each for each in marks if each[: len(at)] == at]:
             del marks[place]
     document.overrides[at] = label
     return []
+
+
+def _set_by_option(document: Document, at: Location, label: str) -> str:
+    """Return the option that set the same before.
+
+    Of two `--set` the last one counts, and `--source` brings a source whose settings may change.
+    """
+    before = document.overrides.get(at, "")
+    return "" if before == label or before.startswith(("--set ", "--source ")) else before
 
 
 def encoding_fault(text: str) -> str | None:

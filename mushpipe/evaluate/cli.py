@@ -170,11 +170,16 @@ def _require_none(**options: object) -> None:
 
 
 def _judge(request: Request, out: Path | None, report: Path | None, output: Output) -> int:
+    from mushpipe.core.errors import UsageError
     from mushpipe.core.overwriting import make_folder
+    from mushpipe.core.paths import STDIO
     from mushpipe.evaluate.command import perform
 
-    for folder in filter(None, (out, report)):  # before the work that goes into them
-        make_folder(folder)
+    for option, folder in (("--out", out), ("--report", report)):
+        if folder == STDIO:
+            raise UsageError(f"{option} - is no folder: its files cannot go to standard output")
+        if folder is not None:  # before the work that goes into them
+            make_folder(folder)
     # Frames for the page may stand in the temporary results, so those live until it is written.
     with tempfile.TemporaryDirectory(prefix="mushpipe-eval-") as temporary:
         judgement = perform(request, out or Path(temporary), _run)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mushpipe.core.errors import EXIT_DIFFERS
+from mushpipe.core.errors import EXIT_DIFFERS, UsageError
 from mushpipe.core.overwriting import require_writable, spare, write_text
 from mushpipe.options import file_argument, file_option, finite
 
@@ -121,6 +121,7 @@ def bench(
 
     set_up_logging(False)
     require_writable(out)
+    _refuse_overridden(set_ or [])
     plan = compile_document(read_document(graph), load_registry(), set_ or [], recording)
     spare(out, *files_read(plan))
     now = conditions(_endless(plan, frames, speed))
@@ -144,6 +145,18 @@ def bench(
             f"{name} takes {ratio:.2f} times as long as in {baseline}; --allow is {allow:g}"
         )
     raise typer.Exit(EXIT_DIFFERS if too_slow else 0)
+
+
+def _refuse_overridden(overrides: list[str]) -> None:
+    """Raise UsageError where a change would be lost, since `bench` sets the same."""
+    instead = {
+        "source.max_frames": "say --frames",
+        "source.speed": "say --speed",
+        "source.loop": "the recording plays over and over, up to --frames",
+    }
+    for text in overrides:
+        if (why := instead.get(text.partition("=")[0].strip())) is not None:
+            raise UsageError(f"--set {text} has no effect here: {why}")
 
 
 def _endless(plan: Plan, frames: int, speed: float) -> Plan:

@@ -86,7 +86,7 @@ class RealsenseSource(ReplaySource):
         5.0, ge=1, le=600, description="a camera that is silent for longer counts as lost, s"
     )
     reconnect_s: float = Field(
-        60.0, ge=0, description="how long to wait for a lost camera to come back, s"
+        60.0, ge=0, le=1e9, description="how long to wait for a lost camera to come back, s"
     )
 
     _link: Link | None = PrivateAttr(None)

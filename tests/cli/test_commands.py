@@ -203,6 +203,21 @@ def test_faults_of_a_graph_are_printed_together_with_places(folder: Path) -> Non
             "error: empty.mcap cannot be a folder: File exists\n",
         ),
         (
+            ["eval", "graph.yaml", "--report", "-"],
+            EXIT_USAGE,
+            "error: --report - is no folder: its files cannot go to standard output\n",
+        ),
+        (
+            ["bench", "graph.yaml", "--set", "source.max_frames=50"],
+            EXIT_USAGE,
+            "error: --set source.max_frames=50 has no effect here: say --frames\n",
+        ),
+        (
+            ["run", "graph.yaml", "--frames", "3", "--set", "source.max_frames=5"],
+            EXIT_USAGE,
+            "--set source.max_frames=5: --frames 3 sets this to 3: give one of them\n",
+        ),
+        (
             ["view", "results.mcap", "--save", "a{b}.rrd"],
             EXIT_USAGE,
             "error: --save a{b}.rrd: {b} is not known: only {recording} is\n",

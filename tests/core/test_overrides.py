@@ -104,6 +104,29 @@ def test_a_label_of_the_callers_own():
     assert str(problem).startswith("--speed 1: unknown path 'sorce.speed'")
 
 
+def test_an_option_and_a_change_that_contradict_each_other_are_refused():
+    changed = document()
+    assert apply_override(changed, "source.count=3", "--frames 3") == []
+    (problem,) = apply_override(changed, "source.count=5")
+    assert str(problem) == "--set source.count=5: --frames 3 sets this to 3: give one of them"
+    assert changed.data["source"]["count"] == 3
+    assert apply_override(changed, "source.count=3") == []
+
+
+def test_what_an_option_only_lifted_may_be_set():
+    changed = document()
+    assert apply_override(changed, "source.count=null", "--duration 2") == []
+    assert apply_override(changed, "source.count=5") == []
+    assert changed.data["source"]["count"] == 5
+
+
+def test_of_two_changes_of_one_setting_the_last_counts():
+    changed = document()
+    for text in ("source.count=3", "source.count=5"):
+        assert apply_override(changed, text) == []
+    assert changed.data["source"]["count"] == 5
+
+
 def test_a_path_into_a_section_that_is_no_mapping():
     broken = parse_document("stages: [1]\n", "graph.yaml", Path())
     (problem,) = apply_override(broken, "stages.segment.level=1")
