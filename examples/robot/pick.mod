@@ -11,7 +11,7 @@ MODULE MushroomPicker
     VAR socketdev vision;
     VAR bool connected := FALSE;
     VAR string picked := "";   ! what the server has not been told yet
-    VAR num newest := 0;       ! number of its newest result when that was accepted
+    VAR string session := "";  ! of the server; ids are of one session only
 
     PROC main()
         WHILE TRUE DO
@@ -34,21 +34,22 @@ MODULE MushroomPicker
 
     PROC Connect()
         VAR string answer;
+        VAR string before;
         SocketCreate vision;
         SocketConnect vision, "127.0.0.1", 5006 \Time:=3;
         answer := Ask("HELLO,1,NAME=irb");   ! one name per robot: another robot, another name
-        IF answer <> "HELLO,1,LIVE" THEN
+        IF StrMatch(answer, 1, "HELLO,1,LIVE,") <> 1 THEN
             TPWrite "vision: " + answer;
             Stop;
         ENDIF
-        ! Under the same name this robot still holds what it had accepted. A smaller number than then
-        ! says that the server was restarted: that id is another mushroom's now.
-        IF picked <> "" THEN
-            IF NewestResult() >= newest THEN
-                answer := Ask("ACK," + picked + ",DONE");
-            ENDIF
-            picked := "";
+        before := session;
+        session := StrPart(answer, 14, StrLen(answer) - 13);
+        ! Under the same name this robot still holds what it had accepted. In another session the
+        ! server was restarted: that id is another mushroom's now.
+        IF picked <> "" AND session = before THEN
+            answer := Ask("ACK," + picked + ",DONE");
         ENDIF
+        picked := "";
         connected := TRUE;
     ENDPROC
 
@@ -80,16 +81,6 @@ MODULE MushroomPicker
             RAISE ERR_ARGVALERR;
         ENDIF
         RETURN value;
-    ENDFUNC
-
-    ! The number in S,RUNNING,42,LIVE.
-    FUNC num NewestResult()
-        VAR string line;
-        VAR string word;
-        line := Ask("STATE");
-        word := Field(line);
-        word := Field(line);
-        RETURN Number(line);
     ENDFUNC
 
     PROC PickOne()
@@ -128,7 +119,6 @@ MODULE MushroomPicker
         IF line <> "A," + id + ",REMOVED" THEN
             RETURN;
         ENDIF
-        newest := NewestResult();
         ! Asked, answered and accepted: all of that took time, and a paused program takes more.
         IF age / 1000 + ClkRead(asked) > VALID_S THEN
             line := Ask("ACK," + id + ",REJECTED");

@@ -74,7 +74,7 @@ class AbbSession:
         if said.get("NAME"):
             self._owner = said["NAME"]
             self._hub.name(self._owner, self)
-        return f"HELLO,1,{self._source()}"
+        return f"HELLO,1,{self._source()},{self._hub.session[:8]}"
 
     def _source(self) -> str:
         return "REPLAY" if self._hub.settings.replay else "LIVE"

@@ -159,7 +159,7 @@ def _answers(lines: Iterable[Line], asked: _Asked) -> Iterator[bytes]:
             if not greeted:
                 yield b"E,REPLAY_REFUSED"
                 return
-            yield re.sub(rb",LIVE$", b",REPLAY", line.text)
+            yield re.sub(rb",LIVE(?=,|$)", b",REPLAY", line.text)
             continue
         if not greeted and body.get("op") != "hello":
             request = asked.next_line()

@@ -107,15 +107,25 @@ def test_what_is_not_understood_costs_nothing(line: str, answer: str) -> None:
         ({}, "NEXT", "E,HELLO_EXPECTED"),
         ({}, "HELLO,1,NAME=a b", "E,BAD_REQUEST"),
         ({"replay": True}, "HELLO,1", "E,REPLAY_REFUSED"),
-        ({"replay": True}, "HELLO,1,REPLAY", "HELLO,1,REPLAY"),
+        ({"replay": True}, "HELLO,1,REPLAY", "HELLO,1,REPLAY,{session}"),
         ({"token": "x" * 16}, "HELLO,1", "E,UNAUTHORISED"),
-        ({"token": "x" * 16}, "HELLO,1,TOKEN=" + "x" * 16, "HELLO,1,LIVE"),
+        ({"token": "x" * 16}, "HELLO,1,TOKEN=" + "x" * 16, "HELLO,1,LIVE,{session}"),
     ],
 )
 def test_beginnings(settings: dict[str, object], hello: str, answer: str) -> None:
     with bench(**settings) as b, arm(b, None) as robot:
-        assert robot.ask(hello) == answer
+        assert robot.ask(hello) == answer.format(session=b.hub.session[:8])
         assert (robot.ask("PING") == "PONG") == answer.startswith("HELLO")
+
+
+def test_a_server_that_was_restarted_greets_with_another_session() -> None:
+    def greeting(b: Bench) -> str:
+        with arm(b, None) as robot:
+            return robot.ask("HELLO,1,NAME=irb")
+
+    with bench() as b, bench() as restarted:
+        assert greeting(b) == greeting(b)
+        assert greeting(restarted) != greeting(b)
 
 
 def test_a_target_can_be_kept_away_for_a_while() -> None:

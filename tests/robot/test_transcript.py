@@ -125,13 +125,16 @@ def test_a_server_is_replayed_to_a_client_and_never_taken_for_live(tmp_path: Pat
     ("hello", "expected"),
     [
         (b"HELLO,1", [b"E,REPLAY_REFUSED"]),
-        (b"HELLO,1,REPLAY", [b"HELLO,1,REPLAY", b"T,0,1.0,2.0,3.0", b"S,RUNNING,4,REPLAY"]),
+        (
+            b"HELLO,1,REPLAY",
+            [b"HELLO,1,REPLAY,6f3a92c1", b"T,0,1.0,2.0,3.0", b"S,RUNNING,4,REPLAY"],
+        ),
     ],
 )
 def test_lines_for_abb_are_replayed_to_a_robot_that_asks_for_a_recording(
     hello: bytes, expected: list[bytes]
 ) -> None:
-    said = (b"HELLO,1,LIVE", b"T,0,1.0,2.0,3.0", b"S,RUNNING,4,LIVE")
+    said = (b"HELLO,1,LIVE,6f3a92c1", b"T,0,1.0,2.0,3.0", b"S,RUNNING,4,LIVE")
     lines = [Line("tx", 1, text, 0) for text in said]
     port: SimpleQueue[int] = SimpleQueue()
     thread = threading.Thread(
