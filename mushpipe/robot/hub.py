@@ -13,7 +13,7 @@ from weakref import WeakValueDictionary
 import orjson
 
 from mushpipe.robot.clock import Clock
-from mushpipe.robot.ledger import Ledger
+from mushpipe.robot.ledger import LINGER_S, Ledger
 from mushpipe.robot.messages import (
     CLIENT_TIMEOUT_S,
     HEARTBEAT_S,
@@ -120,6 +120,23 @@ class Hub:
             self._read = (count, now)
         self.ledger.settle(now)
         self._look()
+        self._doubt()
+
+    def _doubt(self) -> None:
+        """Say it where a target stands on after a robot said that it was done.
+
+        In a recording all of them do.
+        """
+        result = self.newest
+        if result is None or self.settings.replay:
+            return
+        visible = (target.id for target in result.choice.targets)
+        for target, owner in self.ledger.lingering(visible, result.published):
+            logger.warning(
+                "m%d still stands where it was, though robot '%s' said 'done' %g s ago or more: it "
+                "is offered to nobody until it gets a new id",
+                *(target, owner, LINGER_S),
+            )
 
     def _look(self) -> None:
         if self.newest is not None:

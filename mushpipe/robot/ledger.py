@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Set
+from collections.abc import Iterable, Set
 from dataclasses import dataclass
 from typing import Literal
 
 from mushpipe.robot.messages import Outcome, Refusal
 
 MOST_ENTRIES = 4096
+LINGER_S = 10.0
+"""A picked mushroom is gone from sight before that."""
 
 
 @dataclass(frozen=True)
@@ -16,6 +18,12 @@ class _Entry:
     owner: str
     until: float
     accepted: bool  # else it was only put off
+
+
+@dataclass(frozen=True)
+class _Done:
+    owner: str
+    since: float
 
 
 class Ledger:
@@ -28,7 +36,8 @@ class Ledger:
         self.version = 0
         self._claim_s = claim_s
         self._entries: dict[int, _Entry] = {}
-        self._done: dict[int, str] = {}  # for good, with its owner: ids never come twice
+        self._done: dict[int, _Done] = {}  # for good: ids never come twice
+        self._told: set[int] = set()
 
     def settle(self, now: float) -> None:
         """Restore what was claimed or held for long enough."""
@@ -49,6 +58,17 @@ class Ledger:
         """Return whether a target is hidden though no robot is on its way to it."""
         return target in self._entries and not self._entries[target].accepted
 
+    def lingering(self, visible: Iterable[int], seen: float) -> list[tuple[int, str]]:
+        """Return targets that are seen long after they were done, and whose word that was.
+
+        Each of them once.
+        """
+        done = ((key, self._done[key]) for key in visible if key in self._done)
+        found = {key: each.owner for key, each in done if seen - each.since >= LINGER_S}
+        new = [(key, owner) for key, owner in found.items() if key not in self._told]
+        self._told.update(found)
+        return new
+
     def apply(
         self, owner: str, target: int, outcome: Outcome, hold_s: float, visible: bool, now: float
     ) -> Literal["removed", "restored"]:
@@ -61,7 +81,8 @@ class Ledger:
         """
         self.settle(now)
         entry = self._entries.get(target)
-        holder = self._done.get(target, entry.owner if entry else None)
+        word = self._done.get(target, entry)
+        holder = word.owner if word else None
         new = holder is None or (outcome == "accepted" and holder == owner and self.put_off(target))
         if new and not visible:
             raise Refusal("unknown_target", f"m{target} is neither visible nor accepted")
@@ -77,7 +98,7 @@ class Ledger:
         self.version += 1
         self._entries.pop(target, None)
         if outcome == "done":
-            self._done[target] = owner
+            self._done[target] = _Done(owner, now)
             return "removed"
         if held:
             wait = self._claim_s if outcome == "accepted" else hold_s

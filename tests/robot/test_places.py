@@ -23,9 +23,9 @@ def bed(first_id: int, shift: tuple[float, float, float] = (0, 0, 0)) -> Choice:
 class Scene:
     """A hub, and what it offers."""
 
-    def __init__(self) -> None:
+    def __init__(self, replay: bool = False) -> None:
         self.clock = FakeClock()
-        self.hub = Hub(Settings(), self.clock)
+        self.hub = Hub(Settings(replay=replay), self.clock)
 
     def show(self, what: Choice) -> list[int]:
         result = self.hub.publish(what, 0, 0, self.clock.now)
@@ -125,6 +125,37 @@ def test_what_is_done_hides_nothing_that_comes_to_light_there() -> None:
     scene.say("a", 1, "accepted")
     scene.say("a", 1, "done")
     assert scene.show(bed(3)) == [3, 4, 5]
+
+
+def test_what_still_stands_long_after_it_was_done_is_told_once(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    scene = Scene()
+
+    def told(seconds: float, what: Choice | None = None) -> int:
+        scene.clock.now += seconds
+        if what is not None:
+            scene.show(what)
+        scene.hub.tick(scene.clock.now)
+        return caplog.text.count("though robot 'a' said 'done'")
+
+    scene.show(bed(0))
+    scene.say("a", 1, "done")
+    assert told(9.9, bed(0)) == 0
+    assert told(60) == 0  # without a result nobody knows whether it still stands
+    assert told(1, bed(3)) == 0  # out of sight
+    assert [told(1, bed(0)) for _ in range(3)] == [1, 1, 1]
+    assert "m1 still stands where it was" in caplog.text
+
+
+def test_in_a_recording_what_is_done_stands_on(caplog: pytest.LogCaptureFixture) -> None:
+    scene = Scene(replay=True)
+    scene.show(bed(0))
+    scene.say("a", 1, "done")
+    scene.clock.now += 60
+    scene.show(bed(0))
+    scene.hub.tick(scene.clock.now)
+    assert "still stands" not in caplog.text
 
 
 def test_a_claim_in_another_frame_hides_nothing() -> None:
