@@ -63,11 +63,10 @@ class Ledger:
 
         Each of them once.
         """
-        done = ((key, self._done[key]) for key in visible if key in self._done)
-        found = {key: each.owner for key, each in done if seen - each.since >= LINGER_S}
-        new = [(key, owner) for key, owner in found.items() if key not in self._told]
-        self._told.update(found)
-        return new
+        done = [key for key in visible if key in self._done and key not in self._told]
+        late = [key for key in done if seen - self._done[key].since >= LINGER_S]
+        self._told.update(late)
+        return [(key, self._done[key].owner) for key in late]
 
     def apply(
         self, owner: str, target: int, outcome: Outcome, hold_s: float, visible: bool, now: float
