@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -123,6 +124,7 @@ def test_what_is_sent_to_a_viewer_arrives(tmp_path: Path) -> None:
             RerunSink(connect=f"rerun+http://127.0.0.1:{port}/proxy"),
             [trace_of(make_frame(), pick=make_picks())],
         )
+        wait_for_picks(stored, runs=1)
         viewer.send_signal(signal.SIGINT)
         viewer.wait(20)
     finally:
@@ -148,15 +150,28 @@ def test_a_viewer_is_opened_for_this_machine_only(
         ((host, arguments, viewer),) = started
         assert (host, arguments) == ("127.0.0.1", ("--memory-limit", "300MB"))
         assert viewer.poll() is None  # it stays open when the run is over
+        wait_for_picks(stored, runs=2)
     finally:
         for _, _, viewer in started:
             os.killpg(viewer.pid, signal.SIGINT)
             viewer.wait(20)
+    assert runs_with_picks(stored) == len(RrdReader(stored).recordings()) == 2
+
+
+def runs_with_picks(stored: Path) -> int:
     reader = RrdReader(stored)
     shown = [{c.entity_path for c in reader.stream(store=run)} for run in reader.recordings()]
-    assert len(shown) == 2
-    # the viewer's end may have cut off the last one
-    assert any("/camera/image/picks" in entities for entities in shown)
+    return sum("/camera/image/picks" in entities for entities in shown)
+
+
+def wait_for_picks(stored: Path, runs: int) -> None:
+    """Wait until a viewer has stored them: its end cuts off what is still on the way."""
+    for _ in range(200):
+        with suppress(ValueError, RuntimeError):  # there is no file yet, or half a message
+            if runs_with_picks(stored) == runs:
+                return
+        time.sleep(0.1)
+    raise TimeoutError(stored)
 
 
 def wait_for(port: int, listening: bool = True) -> None:
